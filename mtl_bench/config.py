@@ -1,0 +1,289 @@
+"""What a training run is: frozen dataclasses, one canonical JSON, one id.
+
+A `Recipe` is everything about training that is not the method, the backbone or the seed; a `Cell`
+is a recipe with those three, the tasks and the video stage. Two cells with the same values have
+the same id, whatever file or option the values came from.
+"""
+
+import dataclasses
+import hashlib
+import json
+import tomllib
+import typing
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from types import MappingProxyType, UnionType
+from typing import Any
+
+PROTOCOL = 1  # raised when numbers made before stop being comparable with numbers made after
+RECIPES = Path(__file__).parent / "recipes"
+T = typing.TypeVar("T")
+TASKS = ("panoptic", "depth")
+
+
+@dataclass(frozen=True)
+class Data:
+    """The images. `dataset = "synthetic"` is rendered on first use; any other is found by --data."""
+
+    dataset: str = "synthetic"  # synthetic | cityscapes
+    height: int = 64  # network input, pixels; synthetic scenes are rendered at this size
+    width: int = 128
+    train_scenes: int = 800  # synthetic only
+    val_scenes: int = 100  # synthetic only
+    seed: int = 0  # synthetic only: which world
+    cache: bool = True  # keep decoded frames in memory
+    workers: int = 0  # data-loading processes; 0 = in the training process
+
+
+@dataclass(frozen=True)
+class Augment:
+    """Random changes of a training sample; geometry is shared by the three frames and intrinsics."""
+
+    flip: bool = True
+    scales: tuple[float, ...] = (1.0,)  # resize factors, one drawn per sample
+    crop: tuple[int, int] | None = None  # height, width after the resize; smaller images are padded
+    brightness: float = 0.2
+    contrast: float = 0.2
+    saturation: float = 0.2
+    hue: float = 0.05
+
+
+@dataclass(frozen=True)
+class Network:
+    """Sizes of everything behind the backbone; the defaults are the paper's."""
+
+    strides: tuple[int, int, int] = (8, 16, 32)  # pyramid levels that the decoders read
+    channels: int = 128  # ARM, refinement and GCM
+    fused: int = 256  # FFM output
+    head: int = 256  # hidden width of a head
+    pose: str = "resnet18"  # pose encoder: resnet18 (the paper's) | light
+    pose_channels: int = 256
+    min_depth: float = 0.5  # depth = 1 / (sigmoid / min_depth), arbitrary unit
+    batch_norm_momentum: float = 0.01
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Switches of the loss terms; their fixed weights are in `mtl_bench/losses/terms.py`."""
+
+    top_fraction: float = 0.2  # bootstrapped cross-entropy: share of valid pixels kept
+    small_area: int = 4096  # pixels; smaller instances count `small_weight` times
+    small_weight: float = 3.0
+    center_sigma: float = 8.0  # pixels
+    scales: tuple[int, ...] = (0, 1, 2)  # depth outputs in the photometric loss, 0 = finest
+    automask: bool = True  # unwarped frames among the minimum's candidates
+    ssim_weight: float = 0.85
+
+
+@dataclass(frozen=True)
+class Optim:
+    """Optimiser, schedule and length."""
+
+    steps: int = 60000
+    batch: int = 12
+    lr: float = 1e-4  # backbone, GCM, pose network
+    head_lr_factor: float = 10.0  # decoders and heads
+    method_lr: float = 1e-4  # a method's own parameters
+    weight_decay: float = 0.0
+    warmup_steps: int = 1000
+    warmup_factor: float = 0.1
+    poly_power: float = 0.9
+    clip: float | None = 0.01  # total gradient norm
+    accumulate: int = 1  # batches per step
+    precision: str = "fp32"  # fp32 | bf16 | fp16
+    checkpoint_every: int = 1000  # steps
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Post-processing and protocol of the metrics."""
+
+    split: str = "val"
+    center_threshold: float = 0.3
+    nms_kernel: int = 7  # pixels
+    top_k: int = 200  # centers kept; the paper gives none
+    stuff_area: int = 2048  # pixels; smaller stuff segments become void
+    min_depth_m: float = 0.001
+    max_depth_m: float = 80.0
+    depth_crop: str = "none"  # none | garg
+
+
+@dataclass(frozen=True)
+class Latency:
+    """How long to time; the paper uses 500 passes."""
+
+    passes: int = 500
+    warmup: int = 10
+    height: int | None = None  # None: the recipe's input size
+    width: int | None = None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything about training that is not the method, backbone or seed."""
+
+    name: str = "paper"
+    about: str = ""
+    smoke: bool = False  # marks rows that must never be read as results
+    data: Data = field(default_factory=Data)
+    augment: Augment = field(default_factory=Augment)
+    network: Network = field(default_factory=Network)
+    loss: Loss = field(default_factory=Loss)
+    optim: Optim = field(default_factory=Optim)
+    evaluate: Evaluate = field(default_factory=Evaluate)
+    latency: Latency = field(default_factory=Latency)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run and its evaluation."""
+
+    recipe: Recipe
+    backbone: str
+    method: str
+    tasks: tuple[str, ...] = TASKS
+    seed: int = 0
+    video: bool = False
+    pretrained: str | None = None  # None: random initial weights | "timm" | a weights file's name and hash
+    method_args: typing.Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    backbone_args: typing.Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def id(self) -> str:
+        """12 hexadecimal digits of the canonical JSON: recipe values, not the recipe's name."""
+        return hashlib.sha256(canonical_json(self).encode()).hexdigest()[:12]
+
+    @property
+    def slug(self) -> str:
+        """Name of the run's folder."""
+        return f"{self.method}-{self.backbone}-s{self.seed}-{self.id}"
+
+
+# --- to and from plain values ---------------------------------------------------------------------
+
+
+def to_dict(value: Any) -> Any:
+    """Plain values of a (nested) dataclass, as JSON would hold them."""
+    if dataclasses.is_dataclass(value):
+        return {f.name: to_dict(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, typing.Mapping):
+        return {str(k): to_dict(v) for k, v in sorted(value.items())}
+    if isinstance(value, (list, tuple)):
+        return [to_dict(v) for v in value]
+    return value
+
+
+def canonical_json(cell: Cell) -> str:
+    """What makes a cell itself: without names, prose and how often a checkpoint is written."""
+    values = to_dict(cell)
+    for key in ("name", "about"):
+        del values["recipe"][key]
+    del values["recipe"]["optim"]["checkpoint_every"]
+    for key in ("cache", "workers"):
+        del values["recipe"]["data"][key]
+    return json.dumps({"protocol": PROTOCOL, **values}, sort_keys=True, separators=(",", ":"))
+
+
+def from_dict(kind: type[T], values: typing.Mapping[str, Any], where: str = "") -> T:
+    """Build a (nested) dataclass from plain values.
+
+    Raises:
+        ValueError: a key that the dataclass lacks, or a value of another type, with its full path.
+    """
+    types = typing.get_type_hints(kind)
+    fields = {f.name: types[f.name] for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    for key in values:
+        if key not in fields:
+            raise ValueError(f"unknown key '{where}{key}'{did_you_mean(key, fields)}")
+    return kind(**{k: _convert(fields[k], v, f"{where}{k}") for k, v in values.items()})
+
+
+def _convert(kind: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, typing.Mapping):
+            raise ValueError(f"'{where}' is a section, not the value {value!r}")
+        return from_dict(kind, value, f"{where}.")  # type: ignore[arg-type]
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (UnionType, typing.Union):
+        if value is None or value == "none" and type(None) in args and str not in args:
+            return None
+        return _convert(next(a for a in args if a is not type(None)), value, where)
+    if origin is tuple and isinstance(value, (list, tuple)):
+        inner = [args[0]] * len(value) if args[-1] is Ellipsis else args
+        if len(inner) == len(value):
+            return tuple(_convert(a, v, where) for a, v in zip(inner, value, strict=True))
+    elif origin is not None and issubclass(origin, typing.Mapping) and isinstance(value, typing.Mapping):
+        return MappingProxyType(dict(value))
+    elif kind is float and type(value) in (int, float):
+        return float(value)
+    elif type(value) is kind:
+        return value
+    name = getattr(kind, "__name__", str(kind)) if origin is None else str(kind)
+    raise ValueError(f"'{where}' must be {name}, not {value!r}")
+
+
+# --- recipes and overrides ------------------------------------------------------------------------
+
+
+def recipe_names() -> list[str]:
+    return sorted(path.stem for path in RECIPES.glob("*.toml"))
+
+
+def load_recipe(name: str) -> Recipe:
+    """A shipped recipe by name, or a user's by the path of its TOML file.
+
+    Raises:
+        ValueError: no such recipe, or a key or value that a recipe cannot have.
+    """
+    path = Path(name) if name.endswith(".toml") else RECIPES / f"{name}.toml"
+    if not path.is_file():
+        raise ValueError(f"no recipe called '{name}'{did_you_mean(name, recipe_names())}")
+    try:
+        values = tomllib.loads(path.read_text())
+        return from_dict(Recipe, {"name": path.stem, **values})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def override(cell: Cell, settings: typing.Iterable[str]) -> Cell:
+    """Apply `key=value` strings: `recipe.optim.lr=3e-4`, `method.alpha=1.5`, `seed=3`.
+
+    Raises:
+        ValueError: no `=`, an unknown key (with the nearest known one), or a value of another type.
+    """
+    values = to_dict(cell)
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals:
+            raise ValueError(f"'{setting}' is not key=value, such as recipe.optim.lr=3e-4")
+        *sections, last = key.strip().split(".")
+        if sections and sections[0] in ("method", "backbone"):
+            sections[0] += "_args"
+        target = values
+        for section in sections:
+            if not isinstance(target.get(section), dict):
+                raise ValueError(f"unknown key '{key}'{did_you_mean(section, target)}")
+            target = target[section]
+        plug_in = bool(sections) and sections[0].endswith("_args")  # checked when it is constructed
+        if last not in target and not plug_in:
+            raise ValueError(f"unknown key '{key}'{did_you_mean(last, target)}")
+        target[last] = _parse(text.strip())
+    return from_dict(Cell, values)
+
+
+def _parse(text: str) -> Any:
+    """A TOML value, or the text itself where it is not one: `lr=1e-3`, `dataset=cityscapes`."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def did_you_mean(word: str, known: typing.Iterable[str]) -> str:
+    """` (did you mean 'x'?)`, or the known names where none is near."""
+    names = sorted(known)
+    near = get_close_matches(word, names, n=1)
+    if near:
+        return f" (did you mean '{near[0]}'?)"
+    return f" (known: {', '.join(names)})" if names else ""
