@@ -90,7 +90,6 @@ class Optim:
     warmup_factor: float = 0.1
     poly_power: float = 0.9
     clip: float | None = 0.01  # total gradient norm
-    accumulate: int = 1  # batches per step
     precision: str = "fp32"  # fp32 | bf16 | fp16
     checkpoint_every: int = 1000  # steps
 

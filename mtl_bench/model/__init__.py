@@ -1,0 +1,6 @@
+"""The multi-task network and what surrounds it; see `network.py` for the whole picture."""
+
+from mtl_bench.model.backbone import Backbone, TimmBackbone
+from mtl_bench.model.network import Model, Outputs, build_model
+
+__all__ = ["Backbone", "Model", "Outputs", "TimmBackbone", "build_model"]

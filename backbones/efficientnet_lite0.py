@@ -1,0 +1,11 @@
+"""EfficientNet-Lite0: EfficientNet-B0 without squeeze-and-excite; 3.4 M parameters (ra_in1k, Apache-2.0).
+
+Tan, Le, EfficientNet: Rethinking Model Scaling for Convolutional Neural Networks, ICML 2019,
+arXiv:1905.11946; the Lite variant is the TensorFlow team's.
+"""
+
+from mtl_bench.model import TimmBackbone
+
+
+class EfficientNetLite0(TimmBackbone):
+    timm_name = "efficientnet_lite0"

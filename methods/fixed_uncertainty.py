@@ -1,0 +1,32 @@
+"""Fixed weights times learned uncertainty: the paper's final loss.
+
+Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021), section 3.2, last equation: the fixed
+weights are a good first estimate, the log-variances adjust them during training. At the start
+(s = 0) every regression term counts half of what it counts in `fixed`.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mtl_bench.losses.terms import Term
+from mtl_bench.method import LossMethod
+
+
+class FixedUncertainty(LossMethod):
+    """sum_i tau_i exp(-s_i) w_i L_i + s_i / 2
+
+    Args:
+        init: every s_i at the start; 0 in the paper.
+    """
+
+    def __init__(self, terms: Sequence[Term], seed: int = 0, init: float = 0.0):
+        super().__init__(terms, seed)
+        self.log_variance_T = nn.Parameter(torch.full((len(terms),), init))
+        tau = torch.tensor([1.0 if term.kind == "classification" else 0.5 for term in terms])
+        self.register_buffer("scale_T", tau * self.fixed_T, persistent=False)
+
+    def total(self, loss_T: Tensor) -> Tensor:
+        precision_T = torch.exp(-self.log_variance_T)
+        return (self.scale_T * precision_T * loss_T + 0.5 * self.log_variance_T).sum()

@@ -1,0 +1,32 @@
+"""Homoscedastic uncertainty: one learned log-variance per loss term, no fixed weights.
+
+Source: Kendall, Gal, Cipolla, Multi-Task Learning Using Uncertainty to Weigh Losses for Scene
+Geometry and Semantics, CVPR 2018, arXiv:1705.07115, equations 7 and 10. With s = log sigma^2, a
+classification term weighs exp(-s) and a regression term exp(-s)/2; both add s/2.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mtl_bench.losses.terms import Term
+from mtl_bench.method import LossMethod
+
+
+class Uncertainty(LossMethod):
+    """sum_i tau_i exp(-s_i) L_i + s_i / 2
+
+    Args:
+        init: every s_i at the start; 0 in the paper.
+    """
+
+    def __init__(self, terms: Sequence[Term], seed: int = 0, init: float = 0.0):
+        super().__init__(terms, seed)
+        self.log_variance_T = nn.Parameter(torch.full((len(terms),), init))
+        tau = torch.tensor([1.0 if term.kind == "classification" else 0.5 for term in terms])
+        self.register_buffer("tau_T", tau, persistent=False)
+
+    def total(self, loss_T: Tensor) -> Tensor:
+        precision_T = torch.exp(-self.log_variance_T)
+        return (self.tau_T * precision_T * loss_T + 0.5 * self.log_variance_T).sum()

@@ -1,0 +1,148 @@
+"""Look over a whole data set in Cityscapes' layout and report everything that is wrong at once."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mtl_bench.data import cityscapes_files as files
+from mtl_bench.data import png
+from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE, Kind
+
+PUBLISHED_FRAMES = {"train": 2975, "val": 500, "test": 1525}  # of the real Cityscapes
+# What a run needs: which split, which files of every annotated frame
+NEEDS = {
+    "panoptic training": ("train", (IMAGE, CAMERA, LABELS)),
+    "depth training": ("train", (IMAGE, CAMERA, SEQUENCE)),
+    "panoptic evaluation": ("val", (IMAGE, CAMERA, LABELS)),
+    "depth evaluation": ("val", (IMAGE, CAMERA, DISPARITY)),
+}
+_KINDS = (IMAGE, LABELS, SEQUENCE, CAMERA, DISPARITY)
+_SHOWN = 3  # examples of a problem
+
+
+@dataclass(frozen=True)
+class Problem:
+    split: str
+    kind: Kind
+    group: str  # missing, or bad: what the summary counts by
+    text: str  # one line that names the file
+
+    def __str__(self) -> str:
+        return self.text
+
+
+@dataclass
+class Report:
+    """What `check` found.
+
+    Attributes:
+        frames: annotated frames of each split.
+        present: files of each (split, folder) that belong to annotated frames.
+        problems: all of them, in the order of splits and frames.
+    """
+
+    root: Path
+    frames: dict[str, int] = field(default_factory=dict)
+    present: dict[tuple[str, str], int] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+    def obstacle(self, purpose: str) -> str | None:
+        """Why a purpose of NEEDS is out of reach; None where nothing is in its way."""
+        split, kinds = NEEDS[purpose]
+        if not self.frames.get(split):
+            return f"no frames in {IMAGE.folder}/{split}"
+        for kind in kinds:
+            if not self.present[split, kind.folder]:
+                return f"no {kind.folder}/{split}; unpack {kind.package}"
+        count = sum(p.split == split and p.kind in kinds for p in self.problems)
+        return f"{count} problem{'s' * (count > 1)}" if count else None
+
+    def summary(self) -> list[str]:
+        """Lines for a terminal: counts, problems with examples, what the data set is good for."""
+        lines = [str(self.root)]
+        for split, count in self.frames.items():
+            others = ", ".join(f"{self.present[split, k.folder]} {k.what}s" for k in _KINDS[1:])
+            published = PUBLISHED_FRAMES.get(split)
+            known = f" (Cityscapes: {published})" if published else ""
+            lines.append(f"{split}: {count} frames{known}, {others}" if count else f"{split}: none")
+        groups = Counter((p.split, p.group, p.kind) for p in self.problems)
+        for (split, group, kind), count in groups.items():
+            lines.append(f"{split}: {count} {group} {kind.what}{'s' * (count > 1)}")
+            same = [
+                str(p) for p in self.problems if (p.split, p.group, p.kind) == (split, group, kind)
+            ]
+            lines += [f"  {text}" for text in same[:_SHOWN]]
+            lines += [f"  and {count - _SHOWN} more"] if count > _SHOWN else []
+        for purpose, (split, _) in NEEDS.items():
+            if split in self.frames:
+                lines.append(f"{purpose}: {self.obstacle(purpose) or 'ready'}")
+        return lines
+
+
+def check(root: Path, splits: tuple[str, ...] = ("train", "val"), deep: bool = False) -> Report:
+    """Scan a data set: missing files, sizes, bit depths, truncated files, camera values.
+
+    A package of which a split has no file at all counts as not unpacked, not as that many problems.
+
+    Args:
+        root: the folder that holds leftImg8bit, gtFine, ...
+        splits: which splits to look at.
+        deep: decode every image as well: damaged contents and unknown label ids.
+
+    Raises:
+        ValueError: the folder is missing, unreadable or holds no frame of any split.
+    """
+    report = Report(root)
+    some = [split for split in splits if (root / IMAGE.folder / split).is_dir()]
+    for split in some or splits[:1]:  # with none, the first one's error tells what is wrong
+        names = files.annotated_names(root, split)
+        report.frames[split] = len(names)
+        _check_split(report, split, names, deep)
+    report.frames |= {split: 0 for split in splits if split not in some}
+    return report
+
+
+def _check_split(report: Report, split: str, names: list[str], deep: bool) -> None:
+    folders = {kind: report.root / kind.folder / split for kind in _KINDS}
+    listed = {kind: files.names_in(folder, kind) for kind, folder in folders.items()}
+    counts = Counter({kind: 0 for kind in _KINDS})
+    for name in names:
+        image_path = files.file_of(folders[IMAGE], IMAGE, name)
+        size: tuple[int, int] | None = None  # of the image; unknown where it is broken
+        for kind in _KINDS:
+            steps = (-1, 1) if kind is SEQUENCE else (0,)
+            for wanted in (files.neighbour(name, step) for step in steps):
+                path = files.file_of(folders[kind], kind, wanted)
+                if wanted not in listed[kind]:
+                    if listed[kind]:
+                        text = f"{path}: missing; unpack {kind.package}"
+                        report.problems.append(Problem(split, kind, "missing", text))
+                    continue
+                counts[kind] += 1
+                try:
+                    own_size = _check_file(path, kind, deep)
+                    if own_size and size:
+                        files.check_same_size(path, own_size, image_path, size)
+                    size = own_size if kind is IMAGE else size
+                except ValueError as error:
+                    report.problems.append(Problem(split, kind, "bad", str(error)))
+    report.present |= {(split, kind.folder): count for kind, count in counts.items()}
+
+
+def _check_file(path: Path, kind: Kind, deep: bool) -> tuple[int, int] | None:
+    """Height and width of an image file, None of a camera.
+
+    Raises:
+        ValueError: what is wrong with the file.
+    """
+    if kind is CAMERA:
+        files.read_camera(path)
+        return None
+    assert kind.bits is not None
+    header = png.read_header(path)
+    png.check_bits(path, header, kind.bits)
+    if deep and kind is LABELS:
+        files.read_instance_ids(path)
+    elif deep:
+        png.read(path, kind.bits, color=kind.bits == 8)
+    return header.height, header.width

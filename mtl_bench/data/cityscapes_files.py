@@ -1,0 +1,179 @@
+"""Cityscapes on disk: where each file lies and what it says, in NumPy.
+
+`<folder>/<split>/<city>/<city>_<sequence>_<frame><suffix>`; the annotated frame of a snippet has
+its neighbours in `leftImg8bit_sequence`. Every error is a ValueError of one line that names the
+file, the value and the remedy.
+"""
+
+import functools
+import json
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtl_bench.data import png
+from mtl_bench.data.labels import KNOWN_LABEL_IDS
+from mtl_bench.data.targets import DIVISOR, LARGEST_ID
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One of the data set's packages."""
+
+    folder: str
+    suffix: str
+    what: str  # in a sentence: "3 frames lack their ..."
+    bits: int | None = None  # of a PNG
+
+    @property
+    def package(self) -> str:
+        return f"{self.folder}_trainvaltest.zip"
+
+
+IMAGE = Kind("leftImg8bit", "_leftImg8bit.png", "image", 8)
+SEQUENCE = Kind("leftImg8bit_sequence", "_leftImg8bit.png", "neighbour frame", 8)
+LABELS = Kind("gtFine", "_gtFine_instanceIds.png", "label file", 16)
+DISPARITY = Kind("disparity", "_disparity.png", "disparity map", 16)
+CAMERA = Kind("camera", "_camera.json", "camera file")
+
+_NAME = re.compile(r"(?P<city>.+)_(?P<sequence>\d{6})_(?P<frame>\d{6})")
+
+
+# --- names and places -----------------------------------------------------------------------------
+
+
+def split_name(name: str) -> tuple[str, str, int]:
+    """City, sequence, frame number.
+
+    Raises:
+        ValueError: another form than city_000000_000019.
+    """
+    match = _NAME.fullmatch(name)
+    if not match:
+        raise ValueError(f"'{name}' is no frame's name, such as aachen_000000_000019")
+    return match["city"], match["sequence"], int(match["frame"])
+
+
+def neighbour(name: str, step: int) -> str:
+    """The name of the frame that many frames later."""
+    city, sequence, frame = split_name(name)
+    return f"{city}_{sequence}_{frame + step:06d}"
+
+
+def file_of(folder: Path, kind: Kind, name: str) -> Path:
+    """A frame's file of a kind; the folder is `<root>/<kind.folder>/<split>`."""
+    return folder / split_name(name)[0] / f"{name}{kind.suffix}"
+
+
+def names_in(folder: Path, kind: Kind) -> set[str]:
+    """Frames that have a file of this kind; one directory listing a city, no file is opened."""
+    if not folder.is_dir():
+        return set()
+    files = (file.name for city in os.scandir(folder) if city.is_dir() for file in os.scandir(city))
+    return {name.removesuffix(kind.suffix) for name in files if name.endswith(kind.suffix)}
+
+
+def annotated_names(root: Path, split: str) -> list[str]:
+    """Frames of `leftImg8bit/<split>`, sorted.
+
+    Raises:
+        ValueError: the folder is missing, unreadable or empty, or holds other names.
+    """
+    if not root.is_dir():
+        raise ValueError(f"{root}: no such folder; --data takes the folder that holds leftImg8bit")
+    folder = root / IMAGE.folder / split
+    try:
+        names = sorted(names_in(folder, IMAGE))
+    except PermissionError as error:
+        raise ValueError(f"{error.filename}: no permission to read this folder") from error
+    if not names:
+        raise ValueError(
+            f"{folder}: no *{IMAGE.suffix} in it; "
+            f"expected Cityscapes' layout, {IMAGE.folder}/{split}/<city>/"
+        )
+    for name in names:
+        split_name(name)
+    return names
+
+
+# --- contents -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels of the frame; distances in metres."""
+
+    fx: float
+    fy: float
+    u0: float
+    v0: float
+    baseline_m: float  # between the stereo pair
+    height_m: float  # above the ground
+
+
+def read_camera(path: Path) -> Camera:
+    """A frame's own camera file: the extrinsic z is the height above the ground."""
+    try:
+        values = json.loads(path.read_text())
+        intrinsic, extrinsic = values["intrinsic"], values["extrinsic"]
+        focal_and_center = [float(intrinsic[key]) for key in ("fx", "fy", "u0", "v0")]
+        distances = [float(extrinsic[key]) for key in ("baseline", "z")]
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+    except KeyError as error:
+        raise ValueError(f"{path}: no {error} in this camera file") from error
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: not a camera file ({error})") from error
+    camera = Camera(*focal_and_center, *distances)
+    if not (all(map(math.isfinite, vars(camera).values())) and min(camera.fx, camera.fy) > 0):
+        raise ValueError(f"{path}: impossible camera {camera}")
+    return camera
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """[H,W,3] RGB."""
+    return png.read(path, 8, color=True)
+
+
+def read_instance_ids(path: Path) -> NDArray[np.uint16]:
+    """[H,W]: a label id, or label id * 1000 + number for one thing of several."""
+    ids = png.read(path, 16)
+    known = known_instance_ids()[ids]
+    if not known.all():
+        unknown = np.unique(ids[~known])
+        raise ValueError(
+            f"{path}: unknown instance id {unknown[0]} on {np.count_nonzero(~known)} pixels; "
+            f"label ids are 0 to {max(KNOWN_LABEL_IDS)}, alone or times {DIVISOR} plus a number"
+        )
+    return ids
+
+
+@functools.cache
+def known_instance_ids() -> NDArray[np.bool_]:
+    """[65536] which values a label file may hold."""
+    ids = np.arange(LARGEST_ID + 1)
+    return np.isin(np.where(ids < DIVISOR, ids, ids // DIVISOR), list(KNOWN_LABEL_IDS))
+
+
+def read_depth_m(path: Path, camera: Camera) -> NDArray[np.float32]:
+    """[H,W] depth in metres, 0 = no value: baseline * fx / disparity, where the file stores
+    256 * disparity + 1 and 0 for none."""
+    stored = png.read(path, 16).astype(np.float32)
+    disparity: NDArray[np.float32] = np.maximum(stored - 1, 0) / np.float32(256)
+    depth_m = np.zeros_like(disparity)
+    np.divide(camera.baseline_m * camera.fx, disparity, out=depth_m, where=disparity > 0)
+    return depth_m
+
+
+def check_same_size(path: Path, size: tuple[int, ...], image_path: Path, expected: tuple) -> None:
+    """Raises: ValueError where a file's height and width are not those of its image."""
+    if tuple(size[:2]) != tuple(expected[:2]):
+        raise ValueError(
+            f"{path}: {size[0]}x{size[1]} pixels, but {image_path.name} has "
+            f"{expected[0]}x{expected[1]}; both must come from one release"
+        )

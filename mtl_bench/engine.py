@@ -1,0 +1,85 @@
+"""Device, precision and seeds: the only module that knows about them."""
+
+import contextlib
+import hashlib
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+def seed_for(seed: int, purpose: str) -> int:
+    """A seed of its own for every purpose, so that one draw more in one never shifts another."""
+    digest = hashlib.sha256(f"{seed}/{purpose}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+@dataclass
+class Engine:
+    """Where and in which precision a cell runs.
+
+    Raises:
+        ValueError: CUDA asked for where there is none, or fp16 on the CPU.
+    """
+
+    device: torch.device
+    precision: str = "fp32"
+    scaler: torch.amp.GradScaler = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.precision not in DTYPES:
+            raise ValueError(f"no precision '{self.precision}' (known: {', '.join(DTYPES)})")
+        if self.precision == "fp16" and self.device.type == "cpu":
+            raise ValueError("precision fp16 trains on CUDA only: use bf16 or fp32 on the CPU")
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=self.precision == "fp16")
+
+    @property
+    def channels_last(self) -> bool:
+        """The faster memory layout for convolutions on CUDA; slower here on the CPU."""
+        return self.device.type == "cuda"
+
+    def place(self, model: nn.Module) -> nn.Module:
+        layout = torch.channels_last if self.channels_last else torch.contiguous_format
+        return model.to(self.device, memory_format=layout)  # type: ignore[call-overload]
+
+    def autocast(self) -> AbstractContextManager[object]:
+        if self.precision == "fp32":
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, DTYPES[self.precision])
+
+    def apply_gradients(
+        self, optimizer: torch.optim.Optimizer, parameters: list[Tensor], clip: float | None
+    ) -> float:
+        """Unscale, clip to a total norm of `clip`, step. Returns the norm before clipping."""
+        self.scaler.unscale_(optimizer)
+        norm = torch.nn.utils.clip_grad_norm_(parameters, clip if clip is not None else torch.inf)
+        self.scaler.step(optimizer)
+        self.scaler.update()
+        return norm.item()
+
+
+def choose_device(name: str = "auto") -> torch.device:
+    """`auto`: CUDA where there is one. Otherwise a device by name.
+
+    Raises:
+        ValueError: CUDA where there is none, or an unknown device.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name.split(":")[0] not in ("cpu", "cuda"):
+        raise ValueError(f"no device '{name}' (known: auto, cpu, cuda)")
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError("--device cuda, but torch sees no CUDA device here: use --device cpu")
+    return torch.device(name)
+
+
+@contextlib.contextmanager
+def initial_weights(seed: int) -> Iterator[None]:
+    """Everything drawn inside comes from the seed; the global generator is as before after it."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed_for(seed, "initial weights"))
+        yield

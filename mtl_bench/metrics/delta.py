@@ -1,0 +1,41 @@
+"""Multi-task delta: how much better or worse than a baseline over all metrics, in percent.
+
+Two definitions are in use, with opposite signs and different winners, so both have a name.
+"""
+
+from collections.abc import Mapping
+
+
+def delta_flat(
+    values: Mapping[str, float], baseline: Mapping[str, float], higher_is_better: Mapping[str, bool]
+) -> float:
+    """Mean relative loss over all metrics: LOWER is better (Nash-MTL, ICML 2022; FAMO)."""
+    gains = [_gain(name, values, baseline, up) for name, up in higher_is_better.items()]
+    return -sum(gains) / len(gains)
+
+
+def delta_task(
+    values: Mapping[str, float],
+    baseline: Mapping[str, float],
+    higher_is_better: Mapping[str, bool],
+    task_of: Mapping[str, str],
+) -> float:
+    """Mean over tasks of the mean relative gain of a task's metrics: HIGHER is better.
+
+    Source: Maninis et al., CVPR 2019. A task with many metrics weighs no more than one with few.
+    """
+    by_task: dict[str, list[float]] = {}
+    for name, up in higher_is_better.items():
+        by_task.setdefault(task_of[name], []).append(_gain(name, values, baseline, up))
+    return sum(sum(gains) / len(gains) for gains in by_task.values()) / len(by_task)
+
+
+def _gain(
+    name: str, values: Mapping[str, float], baseline: Mapping[str, float], higher_is_better: bool
+) -> float:
+    if baseline[name] == 0:
+        raise ValueError(
+            f"baseline of '{name}' is 0: a relative change is not defined, leave it out"
+        )
+    change = 100 * (values[name] - baseline[name]) / abs(baseline[name])
+    return change if higher_is_better else -change

@@ -1,0 +1,77 @@
+"""What a backbone is: an image in, a feature pyramid out, keyed by stride."""
+
+from pathlib import Path
+
+import timm
+import torch
+from torch import Tensor, nn
+
+
+class Backbone(nn.Module):
+    """Base of every file in `backbones/`.
+
+    A subclass sets `channels` and implements `forward`. Its constructor takes `strides`, the
+    pyramid levels that will be read (deeper ones need not be built), and `pretrained`.
+    """
+
+    mean: tuple[float, float, float] = (0.485, 0.456, 0.406)  # RGB in [0, 1], what it was trained with
+    std: tuple[float, float, float] = (0.229, 0.224, 0.225)
+    channels: dict[int, int]  # stride -> channels
+
+    def forward(self, image_B3HW: Tensor) -> dict[int, Tensor]:
+        """Normalised image -> {stride: features [B, channels[stride], H/stride, W/stride]}."""
+        raise NotImplementedError
+
+
+class TimmBackbone(Backbone):
+    """Any timm model with `features_only`: a subclass needs `timm_name` and a docstring.
+
+    Args:
+        strides: pyramid levels to return; stages deeper than the last are not built.
+        pretrained: None for random weights, "timm" for timm's own (hub or local cache), or the
+            path of a .pth or .safetensors file with timm's parameter names.
+    """
+
+    timm_name: str
+
+    def __init__(self, strides: tuple[int, ...] = (8, 16, 32), pretrained: str | None = None):
+        super().__init__()
+        overlay = None
+        if pretrained not in (None, "timm"):
+            if not Path(str(pretrained)).is_file():
+                raise ValueError(f"no weights file '{pretrained}'; --pretrained takes 'timm' or a file")
+            overlay = {"file": str(pretrained)}
+        levels = tuple(range(max(strides).bit_length() - 1))  # stride 2 is level 0
+        self.pyramid = timm.create_model(
+            self.timm_name,
+            pretrained=pretrained is not None,
+            pretrained_cfg_overlay=overlay,
+            features_only=True,
+            out_indices=levels,
+        )
+        info = self.pyramid.feature_info
+        reductions = dict(zip(info.reduction(), info.channels(), strict=True))
+        self.channels = {stride: reductions[stride] for stride in strides}
+        self._stride_of_level = info.reduction()
+        config = self.pyramid.default_cfg if pretrained else {}
+        self.mean = config.get("mean", Backbone.mean)
+        self.std = config.get("std", Backbone.std)
+
+    def forward(self, image_B3HW: Tensor) -> dict[int, Tensor]:
+        features = self.pyramid(image_B3HW)
+        found = dict(zip(self._stride_of_level, features, strict=True))
+        return {stride: found[stride] for stride in self.channels}
+
+
+class Normalize(nn.Module):
+    """RGB in [0, 1] -> zero mean, unit variance per channel of the pre-training images."""
+
+    def __init__(self, mean: tuple[float, ...], std: tuple[float, ...]):
+        super().__init__()
+        self.register_buffer("mean_311", torch.tensor(mean).view(3, 1, 1), persistent=False)
+        self.register_buffer("std_311", torch.tensor(std).view(3, 1, 1), persistent=False)
+        self.mean_311: Tensor
+        self.std_311: Tensor
+
+    def forward(self, image_B3HW: Tensor) -> Tensor:
+        return (image_B3HW - self.mean_311) / self.std_311

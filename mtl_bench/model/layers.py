@@ -1,0 +1,112 @@
+"""The building blocks behind the backbone: GCM, ARM, FFM, decoder, head.
+
+Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021), after BiSeNet (Yu et al., ECCV 2018).
+Departure: BatchNorm followed by LeakyReLU(0.01) where the paper has InPlaceABN. Same parameters
+and shapes; InPlaceABN scales by |gamma| + eps, BatchNorm by gamma.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+LEAK = 0.01  # LeakyReLU slope of the paper's InPlaceABN
+
+
+class ConvNorm(nn.Sequential):
+    """Convolution without bias, BatchNorm, LeakyReLU (or nothing where `leaky` is off)."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, leaky: bool = True):
+        layers: list[nn.Module] = [
+            nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=False),
+            nn.BatchNorm2d(outputs),
+        ]
+        super().__init__(*layers, *([nn.LeakyReLU(LEAK, inplace=True)] if leaky else []))
+
+
+class GlobalContext(nn.Module):
+    """GCM: the image's mean feature, as a map of one pixel that broadcasts."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.conv = ConvNorm(inputs, outputs, 1)
+
+    def forward(self, deepest_BCHW: Tensor) -> Tensor:
+        return self.conv(deepest_BCHW.mean((2, 3), keepdim=True))
+
+
+class AttentionRefinement(nn.Module):
+    """ARM: a 3x3 convolution whose channels are gated by their own global mean."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.conv = ConvNorm(inputs, outputs, 3)
+        self.gate = ConvNorm(outputs, outputs, 1, leaky=False)
+
+    def forward(self, x_BCHW: Tensor) -> Tensor:
+        features = self.conv(x_BCHW)
+        return features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+
+
+class FeatureFusion(nn.Module):
+    """FFM: a 1x1 convolution over the concatenation, plus itself gated by its global mean."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.conv = ConvNorm(inputs, outputs, 1)
+        self.gate = nn.Sequential(  # neither bias nor norm, as in the paper's code
+            nn.Conv2d(outputs, outputs, 1, bias=False),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(outputs, outputs, 1, bias=False),
+        )
+
+    def forward(self, skip_BCHW: Tensor, deep_BCHW: Tensor) -> Tensor:
+        features = self.conv(torch.cat([skip_BCHW, deep_BCHW], 1))
+        return features + features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+
+
+class Decoder(nn.Module):
+    """One task's way from three pyramid levels back to the finest of them.
+
+    Args:
+        inputs: channels of the finest, middle and deepest level.
+        channels: width of the refinement; the paper's 128.
+        fused: width of the output; the paper's 256.
+    """
+
+    def __init__(self, inputs: tuple[int, int, int], channels: int, fused: int):
+        super().__init__()
+        skip, middle, deep = inputs
+        self.arm_deep = AttentionRefinement(deep, channels)
+        self.arm_middle = AttentionRefinement(middle, channels)
+        self.refine_deep = ConvNorm(channels, channels, 3)
+        self.refine_middle = ConvNorm(channels, channels, 3)
+        self.fusion = FeatureFusion(skip + channels, fused)
+
+    def forward(self, pyramid: list[Tensor], context_BC11: Tensor) -> list[Tensor]:
+        """Finest first: the output, and the two inner maps that auxiliary depth heads read."""
+        skip, middle, deep = pyramid
+        inner_deep = self.arm_deep(deep) + context_BC11
+        up = self.refine_deep(F.interpolate(inner_deep, middle.shape[2:]))
+        inner_middle = self.arm_middle(middle) + up
+        up = self.refine_middle(F.interpolate(inner_middle, skip.shape[2:]))
+        return [self.fusion(skip, up), inner_middle, inner_deep]
+
+
+class Head(nn.Sequential):
+    """3x3 ConvNorm and a 1x1 convolution without bias: features -> logits."""
+
+    def __init__(self, inputs: int, hidden: int, outputs: int):
+        super().__init__(ConvNorm(inputs, hidden, 3), nn.Conv2d(hidden, outputs, 1, bias=False))
+
+
+def init_fan_in(module: nn.Module) -> None:
+    """Normal weights of standard deviation 1/sqrt(fan_in), zero bias: the paper's initialisation
+    of every decoder and head but depth's."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Conv2d):
+            fan_in = layer.in_channels // layer.groups * math.prod(layer.kernel_size)
+            nn.init.normal_(layer.weight, std=fan_in**-0.5)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
