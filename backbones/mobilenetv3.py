@@ -1,4 +1,4 @@
-"""MobileNetV3-Large 1.0: searched mobile network; 3.0 M parameters, Apache-2.0 weights (ra_in1k).
+"""MobileNetV3-Large 1.0: searched mobile network; 3.0 M parameters, Apache-2.0 (ra_in1k).
 
 Howard et al., Searching for MobileNetV3, ICCV 2019, arXiv:1905.02244.
 """

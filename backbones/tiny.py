@@ -3,6 +3,8 @@
 Not a published network; its numbers mean nothing.
 """
 
+from itertools import pairwise
+
 from torch import Tensor, nn
 
 from mtl_bench.model import Backbone
@@ -14,12 +16,12 @@ class Tiny(Backbone):
     ):
         super().__init__()
         if pretrained is not None:
-            raise ValueError(f"the tiny backbone has no pre-trained weights (asked for '{pretrained}')")
+            raise ValueError(f"there are no pre-trained weights for this: '{pretrained}'")
         widths = [3, width, width, 2 * width, 4 * width, 4 * width]
         depth = max(strides).bit_length() - 1
         self.stages = nn.ModuleList(
             nn.Sequential(nn.Conv2d(i, o, 3, 2, 1), nn.GroupNorm(4, o), nn.ReLU())
-            for i, o in zip(widths[:depth], widths[1 : depth + 1], strict=True)
+            for i, o in pairwise(widths[: depth + 1])
         )
         self.channels = {stride: widths[stride.bit_length() - 1] for stride in strides}
 

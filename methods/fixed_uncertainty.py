@@ -21,6 +21,8 @@ class FixedUncertainty(LossMethod):
         init: every s_i at the start; 0 in the paper.
     """
 
+    scale_T: Tensor
+
     def __init__(self, terms: Sequence[Term], seed: int = 0, init: float = 0.0):
         super().__init__(terms, seed)
         self.log_variance_T = nn.Parameter(torch.full((len(terms),), init))

@@ -87,9 +87,7 @@ def _term_backwards(
 
 
 def _flatten(grads: Sequence[Tensor | None], like: Sequence[Tensor]) -> Tensor:
-    parts = [
-        torch.zeros_like(p) if g is None else g for g, p in zip(grads, like, strict=True)
-    ]
+    parts = [torch.zeros_like(p) if g is None else g for g, p in zip(grads, like, strict=True)]
     return torch.cat([part.flatten().float() for part in parts])
 
 

@@ -4,11 +4,12 @@ Made from the ground truth of the training split alone, and the same for every i
 of each pixel, and the class that each pixel has most often. Things become one instance a class.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mtl_bench import config, postprocess
+from mtl_bench.data.cityscapes import Cityscapes
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE, LabelSet
 from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.data.targets import class_of_instance_id
@@ -39,14 +41,14 @@ def baselines(
     `depth_median` scales the mean depth image like any prediction. `depth_dgc` leaves it as it is:
     it is in metres already. Kept in `cache_dir`, one file for each data set and protocol.
     """
-    cell = _plain(cell)
+    cell = dataclasses.replace(cell, tasks=config.TASKS, video=False)  # the truth of both tasks
     split = split or cell.recipe.evaluate.split
-    training = open_dataset(cell, "train", root, training=False)
-    dataset = open_dataset(cell, split, root, training=False)
+    training = open_dataset(cell, "train", root, training=False).uncached()
+    dataset = open_dataset(cell, split, root, training=False).uncached()
     settings = {
         "version": [VERSION, config.PROTOCOL],
         "root": str(root.resolve()),
-        "data": config.to_dict(cell.recipe.data),
+        "data": config.to_dict(dataclasses.replace(cell.recipe.data, cache=False, workers=0)),
         "evaluate": config.to_dict(cell.recipe.evaluate),
         "labels": labels.name,
         "frames": [split, *training.names, *dataset.names],
@@ -56,14 +58,21 @@ def baselines(
     if path.is_file():
         return Evaluation(**json.loads(path.read_text()))
 
-    total = len(training) + len(dataset)
-    class_HW, depth_m_HW = average(training, cell, labels, progress, total)
+    done, total = 0, len(training) + len(dataset)
+
+    def step(frames: int) -> None:
+        nonlocal done
+        done += frames
+        if progress:
+            progress(done, total)
+
+    average = _average(training, cell, labels, step)
+    class_HW, depth_m_HW = average.class_HW(), average.depth_m_HW()
     collector = Collector(cell, labels, len(dataset))
     for batch in eval_batches(dataset, BATCH):
         count = len(batch.names)
         collector.update(batch, _constant(class_HW, depth_m_HW, count, cell, labels))
-        if progress:
-            progress(len(training) + collector.seen, total)
+        step(count)
     evaluation = collector.result(split, torch.device("cpu"))
     evaluation.protocol |= {"engine": "none", "dgc_ground": "none: the mean depth is in metres"}
     evaluation.samples = {}
@@ -76,55 +85,62 @@ def baselines(
     return evaluation
 
 
-def average(
-    training: Any, cell: config.Cell, labels: LabelSet, progress: Progress | None, total: int
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The most frequent class (IGNORE where none was ever seen) and the mean depth of each pixel.
+class Average:
+    """The most frequent class and the mean depth of each pixel, frame by frame."""
 
-    Ties go to the lowest class. A pixel that never had a valid depth takes its nearest neighbour's.
+    def __init__(self, labels: LabelSet, ev: config.Evaluate, size: tuple[int, ...]) -> None:
+        self.class_of_id = class_of_instance_id(labels)
+        self.ev = dataclasses.replace(ev, depth_crop="none")
+        self.votes = np.zeros((len(labels), *size), np.int32)
+        self.depth_sum = np.zeros(size)
+        self.depth_count = np.zeros(size, np.int32)
 
-    Raises:
-        ValueError: frames of different sizes, or no valid depth at all.
-    """
-    ev = config.Evaluate(
-        min_depth_m=cell.recipe.evaluate.min_depth_m, max_depth_m=cell.recipe.evaluate.max_depth_m
-    )
-    class_of_id = class_of_instance_id(labels)
-    votes = depth_sum = depth_count = None
-    done = 0
+    def add(self, instance_ids_HW: NDArray, depth_m_HW: NDArray) -> None:
+        class_HW = self.class_of_id[instance_ids_HW]
+        for index in np.unique(class_HW[class_HW != IGNORE]):
+            self.votes[index] += class_HW == index
+        valid_HW = evaluation_mask(depth_m_HW, self.ev)
+        self.depth_sum += np.where(valid_HW, depth_m_HW, 0)
+        self.depth_count += valid_HW
+
+    def class_HW(self) -> NDArray[np.uint8]:
+        """IGNORE where no class was ever seen; ties go to the lowest."""
+        most_HW = self.votes.argmax(0).astype(np.uint8)
+        most_HW[self.votes.max(0) == 0] = IGNORE
+        return most_HW
+
+    def depth_m_HW(self) -> NDArray[np.float32]:
+        """Where no depth was ever valid, the nearest pixel's that has one."""
+        if not self.depth_count.any():
+            raise ValueError("no frame of the training split has a valid depth")
+        nearest = ndimage.distance_transform_edt(
+            self.depth_count == 0, return_distances=False, return_indices=True
+        )
+        mean_HW = self.depth_sum / np.maximum(self.depth_count, 1)
+        return mean_HW[tuple(nearest)].astype(np.float32)
+
+
+def _average(
+    training: Cityscapes, cell: config.Cell, labels: LabelSet, step: Callable[[int], None]
+) -> Average:
+    """Average a split's frames, which must have one size."""
+    average = None
     for batch in eval_batches(training, BATCH):
-        for name, ids, depth in zip(
-            batch.names, batch.instance_ids_BHW, batch.depth_m_BHW, strict=True
-        ):
-            class_HW, depth_HW = class_of_id[ids.numpy()], depth.numpy()
-            if votes is None:
-                votes = np.zeros((len(labels), *class_HW.shape), np.int32)
-                depth_sum, depth_count = (
-                    np.zeros(depth_HW.shape),
-                    np.zeros(depth_HW.shape, np.int32),
-                )
-            if class_HW.shape != votes.shape[1:]:
-                raise ValueError(
-                    f"{name} is {class_HW.shape}, frames before it {votes.shape[1:]}: "
-                    "an average image needs frames of one size"
-                )
-            for index in np.unique(class_HW[class_HW != IGNORE]):
-                votes[index] += class_HW == index
-            valid_HW = evaluation_mask(depth_HW, ev)
-            depth_sum += np.where(valid_HW, depth_HW, 0)
-            depth_count += valid_HW
-        done += len(batch.names)
-        if progress:
-            progress(done, total)
-    if votes is None or not depth_count.any():
-        raise ValueError("the training split has no frame with a valid depth")
-    most_HW = votes.argmax(0).astype(np.uint8)
-    most_HW[votes.max(0) == 0] = IGNORE
-    nearest = ndimage.distance_transform_edt(
-        depth_count == 0, return_distances=False, return_indices=True
-    )
-    mean_HW = depth_sum / np.maximum(depth_count, 1)
-    return most_HW, mean_HW[tuple(nearest)].astype(np.float32)
+        if batch.instance_ids_BHW is None or batch.depth_m_BHW is None:
+            raise ValueError(f"no ground truth for {batch.names[0]} of the training split")
+        size = tuple(batch.depth_m_BHW.shape[1:])
+        average = average or Average(labels, cell.recipe.evaluate, size)
+        if size != average.depth_sum.shape:
+            raise ValueError(
+                f"{batch.names[0]} is {size}, frames before it {average.depth_sum.shape}: "
+                "an average image needs frames of one size"
+            )
+        for ids, depth in zip(batch.instance_ids_BHW, batch.depth_m_BHW, strict=True):
+            average.add(ids.numpy(), depth.numpy())
+        step(len(batch.names))
+    if average is None:
+        raise ValueError("the training split is empty")
+    return average
 
 
 def _constant(
@@ -133,12 +149,9 @@ def _constant(
     """The same prediction for `count` frames, through the same post-processing as a network's."""
     class_BHW = torch.from_numpy(class_HW).long().expand(count, -1, -1)
     nothing_B1HW = torch.zeros(count, 1, *class_HW.shape)
+    nothing_B2HW = nothing_B1HW.expand(-1, 2, -1, -1)
     panoptic_BHW = postprocess.panoptic(
-        class_BHW,
-        nothing_B1HW,
-        nothing_B1HW.expand(-1, 2, -1, -1),
-        labels.things,
-        cell.recipe.evaluate,
+        class_BHW, nothing_B1HW, nothing_B2HW, labels.things, cell.recipe.evaluate
     )
     return Prediction(
         class_BHW=class_BHW,
@@ -146,11 +159,4 @@ def _constant(
         depth_B1HW=torch.from_numpy(depth_m_HW).expand(count, 1, -1, -1),
         dgc_scale_B=torch.ones(count),
         dgc_source_B=torch.full((count,), postprocess.ROAD),
-    )
-
-
-def _plain(cell: config.Cell) -> config.Cell:
-    """The cell with both tasks and without video: the truth is wanted, neighbours are not."""
-    return config.from_dict(
-        config.Cell, {**config.to_dict(cell), "tasks": list(config.TASKS), "video": False}
     )

@@ -4,6 +4,7 @@ import ast
 import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,10 @@ def check(kind: str, name: str) -> list[CheckResult]:
     results.append(load)
     if load.ok:
         plugin = plugins.load(kind, name)
-        checks = METHOD_CHECKS if kind == "methods" else BACKBONE_CHECKS
-        results += [_run(title, lambda run=run: run(plugin)) for title, run in checks.items()]
+        checks: dict[str, Callable[..., None]] = (
+            METHOD_CHECKS if kind == "methods" else BACKBONE_CHECKS
+        )
+        results += [_run(title, partial(run, plugin)) for title, run in checks.items()]
     return results
 
 
@@ -58,7 +61,7 @@ def _run(name: str, call: Callable[[], Any]) -> CheckResult:
 def _documented(path: Path) -> None:
     text = ast.get_docstring(ast.parse(path.read_text())) or ""
     if len(text.splitlines()) < 2:
-        raise ValueError("the file's docstring needs a first line saying what it does, then its source")
+        raise ValueError("the file's docstring needs a line saying what it does, then its source")
 
 
 # --- methods --------------------------------------------------------------------------------------
@@ -102,7 +105,7 @@ def _steps(toy: Quadratics, method: Method, steps: int) -> Tensor:
             for parameter in parameters:
                 if parameter.grad is not None:
                     norm = parameter.grad.norm().clamp_min(1.0)
-                    parameter -= 0.02 * parameter.grad / norm
+                    parameter.sub_(0.02 * parameter.grad / norm)
     return toy.shared.detach().clone()
 
 
@@ -113,7 +116,7 @@ def _learns(kind: type[Method]) -> None:
     _steps(toy, method, 60)
     after = sum(loss.item() for loss in toy.losses().values())
     if not after < before:
-        raise ValueError(f"60 steps on {len(TERMS)} quadratics raised their sum: {before} to {after}")
+        raise ValueError(f"60 steps on {len(TERMS)} bowls raise their sum: {before} to {after}")
 
 
 def _same_seed_same_update(kind: type[Method]) -> None:
@@ -128,7 +131,7 @@ def _state_round_trip(kind: type[Method]) -> None:
     second = kind(TERMS, seed=99)
     second.load_state_dict(first.state_dict())
     if not torch.equal(_steps(toy, second, 3), straight):
-        raise ValueError("3 steps, save, load, 3 steps differs from 6 steps: some state is not saved")
+        raise ValueError("3 steps, save, load, 3 steps is not 6 steps: some state is not saved")
 
 
 def _one_term(kind: type[Method]) -> None:
@@ -141,7 +144,9 @@ def _one_term(kind: type[Method]) -> None:
     assert toy.shared.grad is not None
     cosine = torch.cosine_similarity(plain, toy.shared.grad, dim=0)
     if cosine < 1 - 1e-5:
-        raise ValueError(f"with one term the update is not along its gradient (cosine {cosine:.4f})")
+        raise ValueError(
+            f"one term, but the update is not along its gradient (cosine {cosine:.4f})"
+        )
 
 
 def _finite(kind: type[Method]) -> None:
@@ -161,7 +166,8 @@ def _finite_weights(method: LossMethod, loss_T: Tensor) -> None:
     total = method.total(leaf_T)
     (weight_T,) = torch.autograd.grad(total, leaf_T)
     if not (torch.isfinite(total) and torch.isfinite(weight_T).all()):
-        raise ValueError(f"losses {loss_T.tolist()} give total {total}, weights {weight_T.tolist()}")
+        weights = weight_T.tolist()
+        raise ValueError(f"losses {loss_T.tolist()} give total {total}, weights {weights}")
     if not torch.equal(leaf_T.detach(), loss_T):
         raise ValueError("total() changed its input in place")
 
@@ -206,8 +212,9 @@ def _pyramid(kind: Callable[..., Any]) -> None:
             features = backbone(torch.rand(2, 3, height, width))
             for stride in strides:
                 expected = (2, backbone.channels[stride], height // stride, width // stride)
-                if tuple(features[stride].shape) != expected:
-                    raise ValueError(f"stride {stride}: {tuple(features[stride].shape)} is not {expected}")
+                found = tuple(features[stride].shape)
+                if found != expected:
+                    raise ValueError(f"stride {stride}: {found} is not {expected}")
 
 
 def _every_parameter_trains(kind: Callable[..., Any]) -> None:

@@ -53,7 +53,8 @@ def read(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise ValueError(f"no checkpoint {path}") from None
     except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ValueError(f"{path} is not a readable checkpoint: {str(error).splitlines()[0]}") from None
+        why = str(error).splitlines()[0]
+        raise ValueError(f"{path} is not a readable checkpoint: {why}") from None
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise ValueError(f"{path} is not a checkpoint of format {FORMAT}")
     return state

@@ -1,4 +1,4 @@
-"""One process at a time runs a cell: a file that says who, and is known to be void when they died."""
+"""One process at a time runs a cell: a file that says who, void once that process is dead."""
 
 import contextlib
 import hashlib
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 TOUCH_S = 30.0  # how often a running process renews its claim
-EXPIRES_S = 600.0  # age at which a claim from another machine is void
+EXPIRES_S = 600.0  # age at which a claim is void
 LAUNCHER = "MTL_BENCH_LAUNCHER"  # process id of the launcher that started this process
 POLL_S = 1.0
 
@@ -25,25 +25,26 @@ class ClaimedError(Exception):
 def claimed_by(directory: Path) -> dict[str, Any] | None:
     """Who is running a cell now: {"pid": ..., "machine": ...}; None where nobody is.
 
-    A claim of this machine counts as long as its process lives, one of another machine for ten
-    minutes after it was last renewed.
+    A claim is void ten minutes after it was last renewed; on this machine, also as soon as its
+    process is dead.
     """
     path = directory / "claim"
     try:
-        owner = json.loads(path.read_text())
         age_s = time.time() - path.stat().st_mtime
+        text = path.read_text()
     except FileNotFoundError:
         return None
-    except ValueError:  # being written at this moment, or left half-written by a crash
-        return {} if time.time() - path.stat().st_mtime < TOUCH_S else None
-    if owner["machine"] == _machine():
-        return owner if _alive(owner["pid"]) else None
-    return owner if age_s < EXPIRES_S else None
+    try:
+        owner: dict[str, Any] = json.loads(text)
+    except ValueError:  # being written at this moment, or cut off by a crash
+        return {} if age_s < TOUCH_S else None
+    dead = owner.get("machine") == _machine() and not _alive(owner["pid"])
+    return None if dead or age_s > EXPIRES_S else owner
 
 
 @contextlib.contextmanager
 def claim(directory: Path) -> Iterator[None]:
-    """Hold a cell while the block runs.
+    """Hold a cell's run directory, which is made where it is missing, while the block runs.
 
     Started by a launcher, the process also watches it: a launcher that was killed outright takes
     its cells with it, as an interruption, instead of leaving them to run unseen.
@@ -51,6 +52,7 @@ def claim(directory: Path) -> Iterator[None]:
     Raises:
         ClaimedError: another process holds it.
     """
+    directory.mkdir(parents=True, exist_ok=True)
     path = directory / "claim"
     _take(path)
     stop = threading.Event()
@@ -61,7 +63,8 @@ def claim(directory: Path) -> Iterator[None]:
     finally:
         stop.set()
         thread.join()
-        path.unlink(missing_ok=True)
+        if _is_own(path):
+            path.unlink()
 
 
 def _take(path: Path) -> None:
@@ -69,26 +72,66 @@ def _take(path: Path) -> None:
         try:
             descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
         except FileExistsError:
-            owner = claimed_by(path.parent)
-            if owner is not None:
-                raise ClaimedError(
-                    f"{path.parent} is being run by process {owner.get('pid', '?')}"
-                ) from None
-            _discard(path)
+            _discard_void(path)
         else:
             with os.fdopen(descriptor, "w") as file:
-                json.dump({"pid": os.getpid(), "machine": _machine()}, file)
+                json.dump(_signature(), file)
             return
     raise ClaimedError(f"{path.parent} is being taken by another process")
 
 
-def _discard(path: Path) -> None:
-    """Remove a void claim; if another process replaced it in this instant, give it back."""
-    aside = path.with_name(f"claim.{os.getpid()}")
+def _discard_void(path: Path) -> None:
+    """Remove a void claim, and only that one: another process may replace it at any instant."""
     with contextlib.suppress(FileNotFoundError):
+        judged = path.stat()
+        owner = claimed_by(path.parent)
+        if owner is not None:
+            raise ClaimedError(f"{path.parent} is being run by process {owner.get('pid', '?')}")
+        aside = path.with_name(f"claim.{os.getpid()}")
         path.rename(aside)
-        fresh = json.loads(aside.read_text() or "{}").get("pid")
-        if fresh is not None and _alive(fresh) and claimed_by_file(aside):
+        moved = aside.stat()
+        if (moved.st_ino, moved.st_mtime_ns) != (judged.st_ino, judged.st_mtime_ns):
             with contextlib.suppress(FileExistsError):
-                os.link(aside, path)
+                os.link(aside, path)  # not the one judged: give it back
         aside.unlink()
+
+
+def _keep(path: Path, stop: threading.Event) -> None:
+    """Renew the claim; interrupt this process when its launcher has gone or its claim is lost."""
+    launcher = os.environ.get(LAUNCHER)
+    renewed = time.monotonic()
+    while not stop.wait(POLL_S):
+        orphan = launcher is not None and os.getppid() != int(launcher)
+        if orphan or not _is_own(path):
+            os.kill(os.getpid(), signal.SIGTERM)
+            return
+        if time.monotonic() - renewed > TOUCH_S:
+            renewed = time.monotonic()
+            os.utime(path)
+
+
+def _is_own(path: Path) -> bool:
+    try:
+        return bool(json.loads(path.read_text()) == _signature())
+    except (FileNotFoundError, ValueError):
+        return False
+
+
+def _signature() -> dict[str, Any]:
+    return {"pid": os.getpid(), "machine": _machine()}
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        return True
+    state = Path(f"/proc/{pid}/stat")  # killed, but its parent has not asked how it ended: Z
+    return not (state.is_file() and state.read_text().rpartition(")")[2].split()[0] == "Z")
+
+
+def _machine() -> str:
+    """Tells machines apart without naming them."""
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]

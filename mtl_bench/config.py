@@ -10,8 +10,10 @@ import hashlib
 import json
 import tomllib
 import typing
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType, UnionType
 from typing import Any
@@ -24,7 +26,7 @@ TASKS = ("panoptic", "depth")
 
 @dataclass(frozen=True)
 class Data:
-    """The images. `dataset = "synthetic"` is rendered on first use; any other is found by --data."""
+    """The images. "synthetic" is rendered on first use; any other data set is found by --data."""
 
     dataset: str = "synthetic"  # synthetic | cityscapes
     height: int = 64  # network input, pixels; synthetic scenes are rendered at this size
@@ -38,7 +40,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Augment:
-    """Random changes of a training sample; geometry is shared by the three frames and intrinsics."""
+    """Random changes of a training sample, the same for its three frames."""
 
     flip: bool = True
     scales: tuple[float, ...] = (1.0,)  # resize factors, one drawn per sample
@@ -144,9 +146,9 @@ class Cell:
     tasks: tuple[str, ...] = TASKS
     seed: int = 0
     video: bool = False
-    pretrained: str | None = None  # None: random initial weights | "timm" | a weights file's name and hash
-    method_args: typing.Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-    backbone_args: typing.Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    pretrained: str | None = None  # initial weights: None = random | "timm" | a file
+    method_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    backbone_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def id(self) -> str:
@@ -166,7 +168,7 @@ def to_dict(value: Any) -> Any:
     """Plain values of a (nested) dataclass, as JSON would hold them."""
     if dataclasses.is_dataclass(value):
         return {f.name: to_dict(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, typing.Mapping):
+    if isinstance(value, Mapping):
         return {str(k): to_dict(v) for k, v in sorted(value.items())}
     if isinstance(value, (list, tuple)):
         return [to_dict(v) for v in value]
@@ -181,10 +183,21 @@ def canonical_json(cell: Cell) -> str:
     del values["recipe"]["optim"]["checkpoint_every"]
     for key in ("cache", "workers"):
         del values["recipe"]["data"][key]
+    if cell.pretrained not in (None, "timm"):
+        values["pretrained"] = _content_hash(Path(str(cell.pretrained)))
     return json.dumps({"protocol": PROTOCOL, **values}, sort_keys=True, separators=(",", ":"))
 
 
-def from_dict(kind: type[T], values: typing.Mapping[str, Any], where: str = "") -> T:
+@lru_cache
+def _content_hash(weights: Path) -> str:
+    """A weights file counts by what is in it, not by where it is."""
+    if not weights.is_file():
+        raise ValueError(f"no weights file '{weights}'; --pretrained takes 'timm' or a file")
+    with weights.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def from_dict(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
     """Build a (nested) dataclass from plain values.
 
     Raises:
@@ -200,19 +213,20 @@ def from_dict(kind: type[T], values: typing.Mapping[str, Any], where: str = "") 
 
 def _convert(kind: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(kind):
-        if not isinstance(value, typing.Mapping):
+        if not isinstance(value, Mapping):
             raise ValueError(f"'{where}' is a section, not the value {value!r}")
         return from_dict(kind, value, f"{where}.")  # type: ignore[arg-type]
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (UnionType, typing.Union):
-        if value is None or value == "none" and type(None) in args and str not in args:
+        nothing = value == "none" and type(None) in args and str not in args
+        if value is None or nothing:
             return None
         return _convert(next(a for a in args if a is not type(None)), value, where)
     if origin is tuple and isinstance(value, (list, tuple)):
         inner = [args[0]] * len(value) if args[-1] is Ellipsis else args
         if len(inner) == len(value):
             return tuple(_convert(a, v, where) for a, v in zip(inner, value, strict=True))
-    elif origin is not None and issubclass(origin, typing.Mapping) and isinstance(value, typing.Mapping):
+    elif origin is Mapping and isinstance(value, Mapping):
         return MappingProxyType(dict(value))
     elif kind is float and type(value) in (int, float):
         return float(value)
@@ -245,7 +259,7 @@ def load_recipe(name: str) -> Recipe:
         raise ValueError(f"{path}: {error}") from error
 
 
-def override(cell: Cell, settings: typing.Iterable[str]) -> Cell:
+def override(cell: Cell, settings: Iterable[str]) -> Cell:
     """Apply `key=value` strings: `recipe.optim.lr=3e-4`, `method.alpha=1.5`, `seed=3`.
 
     Raises:
@@ -279,7 +293,7 @@ def _parse(text: str) -> Any:
         return text
 
 
-def did_you_mean(word: str, known: typing.Iterable[str]) -> str:
+def did_you_mean(word: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)`, or the known names where none is near."""
     names = sorted(known)
     near = get_close_matches(word, names, n=1)

@@ -71,10 +71,10 @@ def evaluate(
     split = split or cell.recipe.evaluate.split
     dataset = open_dataset(cell, split, root, training=False)
     collector = Collector(cell, labels, total=len(dataset))
-    with _evaluating(model), torch.inference_mode():
+    with evaluating(model), torch.inference_mode():
         for batch in eval_batches(dataset, batch_size):
             batch = batch.to(device)
-            collector.update(batch, predict(model, batch, cell, labels, _true_size(batch)))
+            collector.update(batch, predict(model, batch, cell, labels, true_size(batch)))
             if progress:
                 progress(collector.seen, len(dataset))
     return collector.result(split, device)
@@ -131,7 +131,7 @@ class Collector:
     def update(self, batch: Batch, prediction: Prediction) -> None:
         """Compare one batch; the frames' order is the split's."""
         rows, columns = batch.image_B3HW.shape[2:]
-        self.sizes = ((rows, columns), _true_size(batch))
+        self.sizes = ((rows, columns), true_size(batch))
         for slot, name in enumerate(batch.names):
             picture = {"names": name, "image": _picture(batch, slot)}
             if prediction.instance_ids_BHW is not None:
@@ -159,7 +159,8 @@ class Collector:
         ratio = median_scale(depth_HW, true_m_HW, mask_HW) if mask_HW.any() else 1.0
         self.depth["depth_median"].update(depth_HW * ratio, true_m_HW)
 
-        assert prediction.dgc_source_B is not None and prediction.dgc_scale_B is not None
+        assert prediction.dgc_source_B is not None
+        assert prediction.dgc_scale_B is not None
         source = int(prediction.dgc_source_B[slot])
         self.sources[source] += 1
         if source != postprocess.FAILED:
@@ -219,14 +220,14 @@ class Collector:
                 "depth_crop": ev.depth_crop,
                 "depth_scalings": ["median", "dgc"],
                 "depth_pixels": "where the truth has a value; predicted sky and ego vehicle count",
-                "depth_mean": "of per-image errors; frames whose dgc failed are left out and counted",
+                "depth_mean": "over images; those whose dgc failed are counted, not averaged",
                 "dgc_ground": "predicted road" if "panoptic" in self.cell.tasks else "normals",
             }
         return protocol
 
 
 @contextlib.contextmanager
-def _evaluating(model: nn.Module) -> Iterator[None]:
+def evaluating(model: nn.Module) -> Iterator[None]:
     """Evaluation mode inside; every module's own mode as it was after."""
     modes = [(module, module.training) for module in model.modules()]
     model.eval()
@@ -237,7 +238,7 @@ def _evaluating(model: nn.Module) -> Iterator[None]:
             module.training = mode
 
 
-def _true_size(batch: Batch) -> tuple[int, int]:
+def true_size(batch: Batch) -> tuple[int, int]:
     for truth in (batch.instance_ids_BHW, batch.depth_m_BHW):
         if truth is not None:
             return int(truth.shape[1]), int(truth.shape[2])
@@ -253,14 +254,14 @@ def _array(value: Tensor | None, slot: int, batch: Batch) -> NDArray:
 def _picture(batch: Batch, slot: int) -> NDArray[np.uint8]:
     """The input image [H,W,3] at the size of the ground truth."""
     image = batch.image_B3HW[slot : slot + 1]
-    if _true_size(batch) != tuple(image.shape[2:]):
-        image = F.interpolate(image, _true_size(batch), mode="bilinear", align_corners=False)
+    if true_size(batch) != tuple(image.shape[2:]):
+        image = F.interpolate(image, true_size(batch), mode="bilinear", align_corners=False)
     return (image[0] * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
 
 
 def _flat(prefix: str, values: dict) -> dict[str, float]:
-    """Dotted keys: `per_class` becomes `<prefix>.class.<name>.<key>`; undefined values are dropped."""
-    flat = {}
+    """Dotted keys: `per_class` becomes `<prefix>.class.<name>.<key>`; NaN is dropped."""
+    flat: dict[str, float] = {}
     for key, value in values.items():
         if key == "per_class":
             for name, numbers in value.items():

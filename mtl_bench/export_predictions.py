@@ -19,7 +19,7 @@ from mtl_bench import config
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
 from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.data.targets import DIVISOR
-from mtl_bench.evaluate import Progress, _evaluating, _true_size, predict
+from mtl_bench.evaluate import Progress, evaluating, predict, true_size
 from mtl_bench.model import Model
 
 
@@ -48,14 +48,14 @@ def export_predictions(
         done = 0
         for batch in eval_batches(dataset, batch_size):
             batch = batch.to(device)
-            ids_BHW = predict(model, batch, cell, labels, _true_size(batch)).instance_ids_BHW
+            ids_BHW = predict(model, batch, cell, labels, true_size(batch)).instance_ids_BHW
             assert ids_BHW is not None
             yield from zip(batch.names, ids_BHW.cpu().numpy(), strict=True)
             done += len(batch.names)
             if progress:
                 progress(done, len(dataset))
 
-    with _evaluating(model), torch.inference_mode():
+    with evaluating(model), torch.inference_mode():
         return write_panoptic(out, split, frames())
 
 

@@ -1,8 +1,11 @@
 """The pinhole camera: pixels to points and back, warping one frame into another, surface normals.
 
-Shapes: B samples, H x W pixels. Pixel centres are integers, the top-left one is (0, 0). Camera axes:
-x right, y down, z forward; intrinsics K without skew. Metres, or any other unit that depth and
-translation share. Everything works in the precision of what it is given, on its device.
+Shapes: B samples, H x W pixels. Pixel centres are integers, the top-left one is (0, 0). Camera
+axes: x right, y down, z forward; intrinsics K without skew. Metres, or any other unit that depth
+and translation share. Everything works in the precision of what it is given, on its device.
+
+kornia's warp (`warp_frame_depth`) gives the same image, but no mask, in two to three times the time;
+its normals come from Sobel filters. The tests compare with both of its projections.
 """
 
 import torch
@@ -57,7 +60,8 @@ def project(points_B3HW: Tensor, K_B33: Tensor) -> tuple[Tensor, Tensor]:
     In view: in front of the camera and inside an image of the points' own height and width.
     """
     scaled_B3HW = (K_B33 @ points_B3HW.flatten(2)).view_as(points_B3HW)
-    return _divide(scaled_B3HW)
+    offset_B2HW, half_211, in_view_B1HW = _divide(scaled_B3HW)
+    return (offset_B2HW + half_211).permute(0, 2, 3, 1), in_view_B1HW
 
 
 def warp(
@@ -80,16 +84,15 @@ def warp(
     turned_B3N = (K_B33 @ transform_B44[:, :3, :3] @ _inverse(K_B33)) @ _pixels(depth_B1HW)
     shift_B311 = (K_B33 @ transform_B44[:, :3, 3:]).unsqueeze(-1)
     scaled_B3HW = torch.addcmul(shift_B311, turned_B3N.unflatten(-1, (height, width)), depth_B1HW)
-    pixels_BHW2, valid_B1HW = _divide(scaled_B3HW)
-    half = pixels_BHW2.new_tensor([width - 1, height - 1]) / 2
+    offset_B2HW, half_211, valid_B1HW = _divide(scaled_B3HW)
     # out of view is out of view: the bound keeps points near the camera plane from overflowing
-    grid_BHW2 = (pixels_BHW2 / half - 1).clamp(-4, 4)
+    grid_BHW2 = (offset_B2HW / half_211).clamp(-4, 4).permute(0, 2, 3, 1)
     warped = F.grid_sample(image_B3HW, grid_BHW2, padding_mode="zeros", align_corners=True)
     return warped, valid_B1HW
 
 
 def normals(points_B3HW: Tensor) -> Tensor:
-    """Unit surface normals [B,3,H,W] that point away from the camera: +y on a ground seen from above.
+    """Unit surface normals [B,3,H,W], pointing away from the camera: +y on the ground.
 
     Mean of the unit cross products of four pairs of neighbours, each a right angle apart; border
     pixels take their inner neighbour's. All four turn the same way, unlike in MGNet's public code,
@@ -107,9 +110,8 @@ def normals(points_B3HW: Tensor) -> Tensor:
         (toward(1, -1), toward(-1, -1)),  # down left, up left
         (toward(-1, 1), toward(1, 1)),  # up right, down right
     )
-    total = sum(F.normalize(torch.linalg.cross(a, b, dim=1), dim=1) for a, b in pairs)
-    assert isinstance(total, Tensor)
-    return F.pad(F.normalize(total, dim=1), (1, 1, 1, 1), mode="replicate")
+    units = [F.normalize(torch.linalg.cross(a, b, dim=1), dim=1) for a, b in pairs]
+    return F.pad(F.normalize(torch.stack(units).sum(0), dim=1), (1, 1, 1, 1), mode="replicate")
 
 
 def _pixels(like_B1HW: Tensor) -> Tensor:
@@ -132,12 +134,13 @@ def _inverse(K_B33: Tensor) -> Tensor:
     return inverse
 
 
-def _divide(scaled_B3HW: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels [B,H,W,2] of homogeneous ones, and where they are in view [B,1,H,W]."""
+def _divide(scaled_B3HW: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(x, y) from the image's middle [B,2,H,W] in pixels, the middle, and where it is in view."""
     height, width = scaled_B3HW.shape[-2:]
-    xy_B2HW, z_B1HW = scaled_B3HW[:, :2], scaled_B3HW[:, 2:]
-    pixels_BHW2 = (xy_B2HW / z_B1HW.clamp(min=MIN_Z)).permute(0, 2, 3, 1)
+    half_211 = scaled_B3HW.new_tensor([width - 1, height - 1]).view(2, 1, 1) / 2
+    xy_B2HW, z_B1HW = scaled_B3HW.split((2, 1), 1)
+    offset_B2HW = xy_B2HW / z_B1HW.clamp(min=MIN_Z) - half_211
     with torch.no_grad():
-        x, y = pixels_BHW2.unbind(-1)
-        inside = (x >= -SLACK) & (x <= width - 1 + SLACK) & (y >= -SLACK) & (y <= height - 1 + SLACK)
-        return pixels_BHW2, inside.unsqueeze(1) & (z_B1HW > MIN_Z)
+        inside_B2HW = offset_B2HW.abs() <= half_211 + SLACK
+        in_view_B1HW = inside_B2HW[:, :1] & inside_B2HW[:, 1:] & (z_B1HW > MIN_Z)
+    return offset_B2HW, half_211, in_view_B1HW

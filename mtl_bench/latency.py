@@ -10,11 +10,9 @@ on the device; decoding and resizing are not timed. Eager torch.
 
 import gc
 import itertools
-import platform
 import time
 import weakref
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +26,8 @@ from mtl_bench import config, geometry, postprocess
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.engine import Engine
+from mtl_bench.evaluate import evaluating
+from mtl_bench.provenance import cpu_model
 
 STAGES = ("transfer", "network", "postprocess")
 MIB = 2**20
@@ -74,20 +74,15 @@ def measure(
     if latency.passes < 1:
         raise ValueError(f"latency.passes must be at least 1, not {latency.passes}")
     stages = _stages(model, engine, K_133, camera_height_m, things, evaluate, road)
-    was_training = model.training
-    model.eval()
-    try:
+    with evaluating(model):
         cost = _cost(stages, hosts[0], engine.device)
         with torch.inference_mode():
             rounds = itertools.cycle(hosts)
             for _ in range(latency.warmup):
                 _time_pass(stages, next(rounds), engine.device)
             gc.collect()
-            ms = np.array(
-                [_time_pass(stages, next(rounds), engine.device) for _ in range(latency.passes)]
-            )
-    finally:
-        model.train(was_training)
+            passes = itertools.islice(rounds, latency.passes)
+            ms = np.array([_time_pass(stages, host, engine.device) for host in passes])
     values = {
         **_statistics(ms),
         **cost,
@@ -153,19 +148,18 @@ def _stages(
             return model.net(image_13HW)  # type: ignore[operator]
 
     def finish(out: Any) -> tuple[Tensor | None, Tensor | None]:
-        panoptic_1HW = depth_m = None
+        panoptic_1HW = road_1HW = depth_m_11HW = None
         if out.semantic_BCHW is not None:
+            class_1HW = out.semantic_BCHW.argmax(1)
+            road_1HW = class_1HW == road
             panoptic_1HW = postprocess.panoptic(
-                out.semantic_BCHW, out.center_B1HW, out.offset_B2HW, things, evaluate
+                class_1HW, out.center_B1HW, out.offset_B2HW, things, evaluate
             )
         if out.inverse_depth:
-            depth_111HW = geometry.depth_from_inverse(out.inverse_depth[0].float())
-            road_1HW = torch.zeros_like(depth_111HW[:, 0], dtype=torch.bool)
-            if panoptic_1HW is not None:
-                road_1HW = panoptic_1HW == road * 1000
-            scale_1, _ = postprocess.dgc_scale(depth_111HW, K_133, height_m_1, road_1HW)
-            depth_m = depth_111HW * scale_1.view(-1, 1, 1, 1)
-        return panoptic_1HW, depth_m
+            depth_11HW = geometry.depth_from_inverse(out.inverse_depth[0].float())
+            scale_1, _ = postprocess.dgc_scale(depth_11HW, K_133, height_m_1, road_1HW)
+            depth_m_11HW = depth_11HW * scale_1.view(-1, 1, 1, 1)
+        return panoptic_1HW, depth_m_11HW
 
     return [transfer, network, finish]
 
@@ -302,11 +296,4 @@ def _tensors_in(value: Any) -> Iterator[Tensor]:
 
 
 def _device_name(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_model()

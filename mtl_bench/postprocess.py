@@ -63,8 +63,8 @@ def panoptic(
 ) -> Tensor:
     """Panoptic ids [B,H,W], int64: every thing pixel joins the center that it points nearest to.
 
-    Panoptic-DeepLab's grouping (Cheng et al., CVPR 2020) with MGNet's numbering: centers are numbered
-    from 1 in reading order over all classes, and an instance takes the class that most of its pixels
+    Panoptic-DeepLab's grouping (Cheng et al., CVPR 2020) with MGNet's numbering: centers count from
+    1 in reading order over all classes, and an instance takes the class that most of its pixels
     have (ties: the lowest). Ties of distance go to the first center. In an image without a center,
     thing pixels keep instance 0. Stuff classes of fewer than `ev.stuff_area` pixels become void.
 
@@ -100,17 +100,21 @@ def panoptic(
 
 
 def find_centers(center_B1HW: Tensor, ev: config.Evaluate) -> tuple[Tensor, Tensor]:
-    """Local maxima above the threshold: positions [B,K,2] (y, x), filled up with inf, and counts [B].
+    """Local maxima above the threshold: (y, x) [B,K,2], filled up with inf; counts [B].
 
     In reading order. Where there are more than `ev.top_k`, the highest stay; of equals, the first.
-    Both of two equal neighbours are maxima.
+    A plateau, such as a saturated or an enlarged heat map has, is one center, its first pixel:
+    MGNet's public code makes every pixel of it a center and so cuts the instance into pieces.
     """
     kernel = ev.nms_kernel
     if kernel % 2 == 0:
         raise ValueError(f"evaluate.nms_kernel must be odd, not {kernel}")
     heat_B1HW = center_B1HW.float()
-    highest_B1HW = F.max_pool2d(heat_B1HW, kernel, stride=1, padding=kernel // 2)
-    is_peak_B1HW = (heat_B1HW == highest_B1HW) & (heat_B1HW > ev.center_threshold)
+    is_peak_B1HW = (heat_B1HW == _highest(heat_B1HW, kernel)) & (heat_B1HW > ev.center_threshold)
+    size = heat_B1HW[0].numel()
+    earliness_HW = torch.arange(size, 0, -1, device=heat_B1HW.device).view(heat_B1HW.shape[2:])
+    earliness_B1HW = torch.where(is_peak_B1HW, earliness_HW.double(), 0)  # float32 ends at 2^24
+    is_peak_B1HW &= earliness_B1HW == _highest(earliness_B1HW, kernel)
     image_P, _, y_P, x_P = is_peak_B1HW.nonzero(as_tuple=True)
 
     images = heat_B1HW.shape[0]
@@ -143,6 +147,12 @@ def to_instance_ids(panoptic_BHW: Tensor, labels: LabelSet) -> Tensor:
     label_BHW = label_of_class[index_BHW]
     numbered_BHW = (instance_BHW > 0) & (label_BHW > 0)
     return torch.where(numbered_BHW, label_BHW * DIVISOR + instance_BHW, label_BHW).int()
+
+
+def _highest(x_B1HW: Tensor, kernel: int) -> Tensor:
+    """Maximum of the window around each pixel: of its rows, then of those."""
+    rows_B1HW = F.max_pool2d(x_B1HW, (1, kernel), stride=1, padding=(0, kernel // 2))
+    return F.max_pool2d(rows_B1HW, (kernel, 1), stride=1, padding=(kernel // 2, 0))
 
 
 def _nearest(target_N2: Tensor, image_N: Tensor, centers_BK2: Tensor) -> Tensor:
@@ -194,8 +204,8 @@ def dgc_scale(
 
     Departs from the paper in the normal n. Its normals come from neighbouring pixels of each point
     and are biased by noise (5 % of noise shift the height by a tenth or more), least squares on
-    n . X = 1 likewise. Here n is one for the image: a level camera's (0, 1, 0), tilted as far as the
-    inverse depth of the ground says (linear in the pixel for a plane, so that noise averages out),
+    n . X = 1 likewise. Here n is one for the image: a level camera's (0, 1, 0), tilted as far as
+    the ground's inverse depth says (linear in the pixel for a plane, so that noise averages out),
     but at most by `max_tilt`. Exact on a plane within that tilt. Only pixels well below the optical
     axis count (BELOW_HORIZON): near the horizon a small tilt changes the height many times over.
 

@@ -13,7 +13,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Progress:
-    """Writes `progress.json` at most every `every_s` seconds; `stop_asked` after SIGINT or SIGTERM."""
+    """Writes `progress.json`, at most every `every_s` seconds; knows whether a signal came."""
 
     def __init__(self, run_dir: Path, echo: Callable[[str], None], every_s: float = 1.0):
         self._path = run_dir / "progress.json"

@@ -28,7 +28,15 @@ HARNESS = (  # what numbers depend on; the rest launches, stores or shows
     "evaluate.py",
     "latency.py",
 )
-PACKAGES = ("mtl-bench", "torch", "torchvision", "timm", "kornia", "numpy", "opencv-python-headless")
+PACKAGES = (
+    "mtl-bench",
+    "torch",
+    "torchvision",
+    "timm",
+    "kornia",
+    "numpy",
+    "opencv-python-headless",
+)
 
 
 def code(cell: Cell) -> dict[str, str]:

@@ -1,14 +1,14 @@
 """The run directory of a cell: what is stored there, and what that says about the cell.
 
-    runs/<method>-<backbone>-s<seed>-<id>/
-        cell.json      what to run, whole
-        code.json      fingerprints of the code that began it: a checkpoint is continued by no other
-        claim          who is running it now
-        progress.json  how far that is
-        last.pt        checkpoint          curve.csv  losses, weights, rate per step
-        log.txt        what the run printed
-        row.json       the result; it appears by rename at the very end, so it exists = done
-        failed.json    why there is none
+runs/<method>-<backbone>-s<seed>-<id>/
+    cell.json      what to run, whole
+    code.json      fingerprints of the code that began it: a checkpoint is continued by no other
+    claim          who is running it now
+    progress.json  how far that is
+    last.pt        checkpoint          curve.csv  losses, weights, rate per step
+    log.txt        what the run printed
+    row.json       the result; it appears by rename at the very end, so it exists = done
+    failed.json    why there is none
 """
 
 import json
@@ -141,8 +141,7 @@ def rows(cells: Iterable[Cell], runs: Path) -> list[dict[str, Any]]:
             "smoke": cell.recipe.smoke,
             "cell": to_dict(cell),
         }
-        word = state.word if state.row is None or state.word != "running" else "done"
-        found.append({**blank, **(state.row or {}), "status": word, "error": state.why})
+        found.append({**blank, **(state.row or {}), "status": state.word, "error": state.why})
     return found
 
 
@@ -150,13 +149,12 @@ def rows(cells: Iterable[Cell], runs: Path) -> list[dict[str, Any]]:
 
 
 def begin(cell: Cell, runs: Path) -> tuple[Path, str]:
-    """Make the run directory ready; what other code had begun is not continued but cleared.
+    """Make a claimed run directory ready; what other code had begun is cleared, not continued.
 
     Returns:
         The directory, and why an earlier start is dropped (empty where none is).
     """
     directory = run_dir(cell, runs)
-    directory.mkdir(parents=True, exist_ok=True)
     before = read_json(directory / "code.json")
     why = changed(before, cell) if before is not None else ""
     if why:

@@ -9,7 +9,7 @@ MODES = ("off", "offline", "online")
 
 
 class Tracker:
-    """Logs a cell's curve and metrics to wandb; a cell's id is its run id, so a resume continues it.
+    """Logs a cell's curve and metrics; its id is wandb's run id, so that a resume continues it.
 
     Raises:
         ValueError: an unknown mode.

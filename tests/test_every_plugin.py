@@ -8,7 +8,9 @@ from mtl_bench.check import check
 PLUGINS = [(kind, name) for kind in plugins.KINDS for name in plugins.files(kind)]
 
 
-@pytest.mark.parametrize(("kind", "name"), PLUGINS, ids=[f"{kind}-{name}" for kind, name in PLUGINS])
+@pytest.mark.parametrize(
+    ("kind", "name"), PLUGINS, ids=[f"{kind}-{name}" for kind, name in PLUGINS]
+)
 def test_plugin(kind, name):
     failed = [f"{result.name}: {result.detail}" for result in check(kind, name) if not result.ok]
     assert failed == []

@@ -162,6 +162,6 @@ def _turn_hue(picture_3HW: Tensor, factor: float) -> Tensor:
     angle = torch.tensor(2 * torch.pi * (factor - 1), dtype=_YIQ.dtype)
     turn = torch.eye(3)
     turn[1, 1] = turn[2, 2] = angle.cos()
-    turn[1, 2], turn[2, 1] = -angle.sin(), angle.sin()
+    turn[1, 2], turn[2, 1] = angle.sin(), -angle.sin()
     map_33 = torch.linalg.solve(_YIQ, turn @ _YIQ)
     return (map_33 @ picture_3HW.flatten(1)).clamp_(0, 1).view_as(picture_3HW)

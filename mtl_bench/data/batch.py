@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -40,7 +41,7 @@ class Batch:
 
     def to(self, device: torch.device | str, channels_last: bool = False) -> Batch:
         """A copy on a device; images in channels-last memory where asked for."""
-        moved = {}
+        moved: dict[str, Any] = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Tensor):
@@ -53,7 +54,7 @@ class Batch:
 
 def collate(samples: list[Batch]) -> Batch:
     """Stack single samples (tensors without the B axis) into a batch; they must have one size."""
-    merged = {}
+    merged: dict[str, Any] = {}
     for field in dataclasses.fields(Batch):
         values = [getattr(sample, field.name) for sample in samples]
         if field.name == "names":

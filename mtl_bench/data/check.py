@@ -43,7 +43,7 @@ class Report:
 
     root: Path
     frames: dict[str, int] = field(default_factory=dict)
-    present: dict[tuple[str, str], int] = field(default_factory=dict)
+    present: Counter[tuple[str, str]] = field(default_factory=Counter)
     problems: list[Problem] = field(default_factory=list)
 
     def obstacle(self, purpose: str) -> str | None:
@@ -105,7 +105,6 @@ def check(root: Path, splits: tuple[str, ...] = ("train", "val"), deep: bool = F
 def _check_split(report: Report, split: str, names: list[str], deep: bool) -> None:
     folders = {kind: report.root / kind.folder / split for kind in _KINDS}
     listed = {kind: files.names_in(folder, kind) for kind, folder in folders.items()}
-    counts = Counter({kind: 0 for kind in _KINDS})
     for name in names:
         image_path = files.file_of(folders[IMAGE], IMAGE, name)
         size: tuple[int, int] | None = None  # of the image; unknown where it is broken
@@ -118,7 +117,7 @@ def _check_split(report: Report, split: str, names: list[str], deep: bool) -> No
                         text = f"{path}: missing; unpack {kind.package}"
                         report.problems.append(Problem(split, kind, "missing", text))
                     continue
-                counts[kind] += 1
+                report.present[split, kind.folder] += 1
                 try:
                     own_size = _check_file(path, kind, deep)
                     if own_size and size:
@@ -126,7 +125,6 @@ def _check_split(report: Report, split: str, names: list[str], deep: bool) -> No
                     size = own_size if kind is IMAGE else size
                 except ValueError as error:
                     report.problems.append(Problem(split, kind, "bad", str(error)))
-    report.present |= {(split, kind.folder): count for kind, count in counts.items()}
 
 
 def _check_file(path: Path, kind: Kind, deep: bool) -> tuple[int, int] | None:

@@ -67,14 +67,18 @@ def neighbour(name: str, step: int) -> str:
 
 def file_of(folder: Path, kind: Kind, name: str) -> Path:
     """A frame's file of a kind; the folder is `<root>/<kind.folder>/<split>`."""
-    return folder / split_name(name)[0] / f"{name}{kind.suffix}"
+    return folder / name.rsplit("_", 2)[0] / f"{name}{kind.suffix}"
 
 
 def names_in(folder: Path, kind: Kind) -> set[str]:
     """Frames that have a file of this kind; one directory listing a city, no file is opened."""
     if not folder.is_dir():
         return set()
-    files = (file.name for city in os.scandir(folder) if city.is_dir() for file in os.scandir(city))
+    try:
+        cities = [city for city in os.scandir(folder) if city.is_dir()]
+        files = [file.name for city in cities for file in os.scandir(city)]
+    except OSError as error:
+        raise ValueError(f"{error.filename}: cannot be listed ({error.strerror})") from error
     return {name.removesuffix(kind.suffix) for name in files if name.endswith(kind.suffix)}
 
 
@@ -87,10 +91,7 @@ def annotated_names(root: Path, split: str) -> list[str]:
     if not root.is_dir():
         raise ValueError(f"{root}: no such folder; --data takes the folder that holds leftImg8bit")
     folder = root / IMAGE.folder / split
-    try:
-        names = sorted(names_in(folder, IMAGE))
-    except PermissionError as error:
-        raise ValueError(f"{error.filename}: no permission to read this folder") from error
+    names = sorted(names_in(folder, IMAGE))
     if not names:
         raise ValueError(
             f"{folder}: no *{IMAGE.suffix} in it; "
@@ -164,8 +165,8 @@ def read_depth_m(path: Path, camera: Camera) -> NDArray[np.float32]:
     """[H,W] depth in metres, 0 = no value: baseline * fx / disparity, where the file stores
     256 * disparity + 1 and 0 for none."""
     stored = png.read(path, 16).astype(np.float32)
-    disparity: NDArray[np.float32] = np.maximum(stored - 1, 0) / np.float32(256)
-    depth_m = np.zeros_like(disparity)
+    disparity = np.maximum(stored - 1, 0) / 256
+    depth_m = np.zeros(stored.shape, np.float32)
     np.divide(camera.baseline_m * camera.fx, disparity, out=depth_m, where=disparity > 0)
     return depth_m
 

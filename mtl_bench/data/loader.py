@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import torch
 from torch import Generator
 
@@ -65,15 +66,10 @@ def train_batches(
             f"a batch of {batch_size} from {len(dataset)} frames; set recipe.optim.batch to at "
             f"most that"
         )
+    steps = _Steps(len(dataset), batch_size, seed, start_step)
     if workers == 0:
-        return _in_process(dataset, batch_size, seed, start_step)
-    loader = torch.utils.data.DataLoader(
-        _Slots(dataset.uncached()),
-        batch_sampler=_Steps(len(dataset), batch_size, seed, start_step),
-        num_workers=workers,
-        collate_fn=collate,
-    )
-    return iter(loader)
+        return (_make_batch(dataset, slots) for slots in steps)
+    return _from_workers(dataset.uncached(), steps, workers)
 
 
 def eval_batches(dataset: Cityscapes, batch_size: int) -> Iterator[Batch]:
@@ -86,21 +82,40 @@ def eval_batches(dataset: Cityscapes, batch_size: int) -> Iterator[Batch]:
 Slot = tuple[int, int]  # index of a sample, seed of its augmentation
 
 
-def _in_process(
-    dataset: Cityscapes, batch_size: int, seed: int, start_step: int
-) -> Iterator[Batch]:
-    slots = _Slots(dataset)
-    for step in _Steps(len(dataset), batch_size, seed, start_step):
-        yield collate([slots[slot] for slot in step])
+def _make_batch(dataset: Cityscapes, slots: list[Slot]) -> Batch:
+    return collate([dataset.sample(index, Generator().manual_seed(seed)) for index, seed in slots])
 
 
-class _Slots(torch.utils.data.Dataset):
+def _from_workers(dataset: Cityscapes, steps: "_Steps", workers: int) -> Iterator[Batch]:
+    loader = torch.utils.data.DataLoader(
+        _Batches(dataset),
+        sampler=steps,
+        batch_size=None,  # an item is a whole batch
+        num_workers=workers,
+        worker_init_fn=_one_thread,
+        generator=Generator(),  # else it draws a seed from the global one, which training uses
+    )
+    for batch in loader:
+        if isinstance(batch, ValueError):
+            raise batch
+        yield batch
+
+
+class _Batches(torch.utils.data.Dataset):
     def __init__(self, dataset: Cityscapes) -> None:
         self.dataset = dataset
 
-    def __getitem__(self, slot: Slot) -> Batch:
-        index, augment_seed = slot
-        return self.dataset.sample(index, Generator().manual_seed(augment_seed))
+    def __getitem__(self, slots: list[Slot]) -> Batch | ValueError:
+        """A batch, or what is wrong with a file: torch would bury that line in a traceback."""
+        try:
+            return _make_batch(self.dataset, slots)
+        except ValueError as error:
+            return error
+
+
+def _one_thread(worker: int) -> None:
+    """As torch does in its workers: more threads than cores would fight over them."""
+    cv2.setNumThreads(1)
 
 
 class _Steps:

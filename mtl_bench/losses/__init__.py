@@ -51,9 +51,7 @@ def _panoptic(batch: Batch, outputs: Outputs, loss: config.Loss) -> dict[str, Te
     semantic, semantic_weight = _full(outputs.semantic_BCHW), _full(batch.semantic_weight_BHW)
     assert batch.semantic_BHW is not None
     return {
-        "semantic": semantic_loss(
-            semantic, batch.semantic_BHW, semantic_weight, loss.top_fraction
-        ),
+        "semantic": semantic_loss(semantic, batch.semantic_BHW, semantic_weight, loss.top_fraction),
         "center": center_loss(
             _full(outputs.center_B1HW), _full(batch.center_B1HW), _full(batch.center_weight_B1HW)
         ),

@@ -31,8 +31,8 @@ def photometric_loss(
 
     - A warped frame whose projection leaves the view (the paper's M_v, absent from its code) is no
       candidate for the minimum; a pixel that no warped frame shows is left out of the mean.
-    - `automask` puts the unwarped frames among the candidates. A tie goes to them: such a pixel pulls
-      on nothing. No noise breaks ties, so that the loss is a function of its inputs.
+    - `automask` puts the unwarped frames among the candidates. A tie goes to them: such a pixel
+      pulls on nothing. No noise breaks ties, so that the loss is a function of its inputs.
     - The mean over scales, where the paper writes a sum (its public code: the mean).
 
     Args:
@@ -41,32 +41,23 @@ def photometric_loss(
         mask_BHW: bool, False on sky, ego vehicle and padding.
     """
     error_of = PhotometricError(target_B3HW, ssim_weight)
-    context_NB3HW = context_BN3HW.transpose(0, 1)
-    transforms_NB44 = transforms_BN44.transpose(0, 1)
-    with torch.no_grad():
-        unwarped_BHW = error_of(context_NB3HW).amin(0) if automask else None
+    contexts = [frame_B3HW.contiguous() for frame_B3HW in context_BN3HW.unbind(1)]
+    unwarped_BHW = None
+    if automask:
+        with torch.no_grad():
+            unwarped_BHW = torch.stack([error_of(frame_B3HW) for frame_B3HW in contexts]).amin(0)
     total = target_B3HW.new_zeros(())
-    for inverse_B1HW in inverse_SB1HW:  # one scale at a time: its tensors stay in the cache
+    for inverse_B1HW in inverse_SB1HW:
         depth_B1HW = geometry.depth_from_inverse(inverse_B1HW)
-        warped_NB3HW, valid_NBHW = _warp_all(context_NB3HW, depth_B1HW, transforms_NB44, K_B33)
-        error_NBHW = error_of(warped_NB3HW).masked_fill(~valid_NBHW, torch.inf)
-        error_BHW = error_NBHW.amin(0)
+        errors, valids = [], []
+        # one image at a time: on a CPU this is faster than one big call, as the cache holds it
+        for frame_B3HW, transform_B44 in zip(contexts, transforms_BN44.unbind(1), strict=True):
+            warped_B3HW, valid_B1HW = geometry.warp(frame_B3HW, depth_B1HW, transform_B44, K_B33)
+            valids.append(valid_B1HW.squeeze(1))
+            errors.append(error_of(warped_B3HW).masked_fill(~valids[-1], torch.inf))
+        error_BHW = torch.stack(errors).amin(0)
         if unwarped_BHW is not None:
             error_BHW = torch.where(error_BHW < unwarped_BHW, error_BHW, unwarped_BHW)
-        counts_BHW = valid_NBHW.any(0) & mask_BHW
+        counts_BHW = torch.stack(valids).any(0) & mask_BHW
         total = total + error_BHW.masked_fill(~counts_BHW, 0).sum() / counts_BHW.sum().clamp(min=1)
     return total / len(inverse_SB1HW)
-
-
-def _warp_all(
-    context_NB3HW: Tensor, depth_B1HW: Tensor, transforms_NB44: Tensor, K_B33: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Every context frame warped into the target [N,B,3,H,W], and its mask [N,B,H,W]: one call."""
-    lead = context_NB3HW.shape[:2]
-    warped, valid = geometry.warp(
-        context_NB3HW.flatten(0, 1),
-        depth_B1HW.expand(*lead, *depth_B1HW.shape[1:]).flatten(0, 1),
-        transforms_NB44.flatten(0, 1),
-        K_B33.expand(*lead, 3, 3).flatten(0, 1),
-    )
-    return warped.unflatten(0, lead), valid.squeeze(1).unflatten(0, lead)

@@ -12,11 +12,11 @@ def semantic_loss(
 ) -> Tensor:
     """Weighted cross-entropy of the K hardest valid pixels of the batch, divided by K.
 
-    Yang et al., "DeeperLab" (2019), as in MGNet's paper: `-1/K sum_i w_i [p_i < t_K] log p_i`. Hard
-    means a low probability of the true class, before the weight. K is a fraction of the valid pixels
-    (labelled, weight above 0), so that crop and batch size do not change its meaning; pixels that
-    tie with the K-th are kept and counted. MGNet's public code ranks weighted losses, keeps all
-    above -log 0.7, and counts in absolute pixels, void ones included.
+    Yang et al., "DeeperLab" (2019), as in MGNet's paper: `-1/K sum_i w_i [p_i < t_K] log p_i`.
+    Hard means a low probability of the true class: the weight does not enter the ranking. K is a
+    fraction of the valid pixels (labelled, weight above 0), so that crop and batch size do not
+    change its meaning; pixels that tie with the K-th are kept and counted. MGNet's public code
+    ranks weighted losses, keeps all above -log 0.7, and counts absolute pixels, void ones included.
 
     Args:
         target_BHW: class indices, 255 = no label.

@@ -14,9 +14,10 @@ def smoothness_loss(
 ) -> Tensor:
     """Gradients of the mean-normalised inverse depth, forgiven where the image has edges.
 
-    Godard et al., "Unsupervised monocular depth estimation with left-right consistency" (CVPR 2017),
-    normalised as in Wang et al. (CVPR 2018). Scale i counts 2^-i. The mean over scales, where the
-    paper writes a sum (its public code: the mean). A difference belongs to its left or top pixel.
+    Godard et al., "Unsupervised monocular depth estimation with left-right consistency" (CVPR
+    2017), normalised as in Wang et al. (CVPR 2018). Scale i counts 2^-i. The mean over scales, where
+    the paper writes a sum (its public code: the mean). A difference belongs to its left or top
+    pixel, and counts where the mask has that pixel.
 
     Args:
         inverse_SB1HW: one inverse depth a scale, all at full resolution.
@@ -36,6 +37,6 @@ def smoothness_loss(
 
 @torch.no_grad()
 def _edge_weights(image_B3HW: Tensor, mask_BHW: Tensor, axis: int) -> Tensor:
-    """exp(-|image gradient|) where the mask has the left or top pixel, divided by the mask's size."""
+    """exp(-|image gradient|) over the number of pixels that count, 0 where one does not."""
     mask = mask_BHW.narrow(axis, 0, mask_BHW.shape[axis] - 1)
     return torch.exp(-image_B3HW.diff(dim=axis).abs().mean(1)) * mask / mask.sum().clamp(min=1)

@@ -35,7 +35,7 @@ def _gain(
 ) -> float:
     if baseline[name] == 0:
         raise ValueError(
-            f"baseline of '{name}' is 0: a relative change is not defined, leave it out"
+            f"baseline of '{name}' is 0, so no change relative to it exists: leave it out"
         )
     change = 100 * (values[name] - baseline[name]) / abs(baseline[name])
     return change if higher_is_better else -change

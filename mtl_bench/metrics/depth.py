@@ -59,7 +59,7 @@ def depth_errors(
 
 
 class DepthErrors:
-    """Mean over images of per-image errors. An image without a valid pixel has none and is counted."""
+    """Mean over images of per-image errors. An image without a valid pixel is only counted."""
 
     def __init__(self, ev: config.Evaluate) -> None:
         self.ev = ev

@@ -1,11 +1,11 @@
 """Panoptic quality by the official rules of Cityscapes and COCO (Kirillov et al., CVPR 2019).
 
-A prediction and a true segment of one class match where their IoU exceeds one half. The union leaves
-out what of the prediction lies on void. An unmatched prediction that lies by more than half on void
-or on a crowd of its class is forgiven, as is every crowd. PQ = sum of IoU / (TP + FP / 2 + FN / 2),
-then the mean over the classes that occur. Equals cityscapesscripts' evaluator, with `ego vehicle`
-void in the truth and the prediction (MGNet's public code leaves its pixels in the truth, where they
-count against road and cars).
+A prediction and a true segment of one class match where their IoU exceeds one half. The union
+leaves out what of the prediction lies on void. An unmatched prediction that lies by more than half
+on void or on a crowd of its class is forgiven, as is every crowd. PQ is the sum of IoU over
+(TP + FP / 2 + FN / 2), averaged over the classes that occur. Equals cityscapesscripts' evaluator,
+with `ego vehicle` void in the truth and the prediction (MGNet's public code leaves its pixels in
+the truth, where they count against road and cars).
 
 Shapes: T true segments, P predicted ones, C classes.
 """
@@ -56,7 +56,7 @@ class Tally:
 
 @dataclass
 class Segments:
-    """One image's segments: ids [H,W], and the sorted distinct ids with a category and crowd flag."""
+    """One image's segments: sorted distinct ids, their categories, and which one a pixel has."""
 
     index_HW: NDArray[np.intp]  # position in `ids`
     ids: NDArray[np.int64]
@@ -86,7 +86,7 @@ def match(predicted: Segments, true: Segments, classes: int) -> Tally:
     found_t, found_p = match_TP.nonzero()
     found = true.category[found_t]
     return Tally(
-        iou=np.bincount(found, weights=iou_TP[found_t, found_p], minlength=classes),
+        iou=np.bincount(found, iou_TP[found_t, found_p], classes).astype(np.float64),
         tp=np.bincount(found, minlength=classes),
         fp=np.bincount(predicted.category[wrong_P], minlength=classes),
         fn=np.bincount(true.category[missed_T], minlength=classes),
@@ -94,7 +94,7 @@ def match(predicted: Segments, true: Segments, classes: int) -> Tally:
 
 
 def segments(ids_HW: NDArray, labels: LabelSet) -> Segments:
-    """Segments of a map of Cityscapes' instance ids; a thing's bare label id in the truth is a crowd."""
+    """Segments of a map of Cityscapes' instance ids; a true thing's bare label id is a crowd."""
     ids, index_HW = np.unique(ids_HW, return_inverse=True)
     classes = class_of_instance_id(labels)[ids].astype(np.int64)
     classes[~np.isin(classes, labels.evaluated)] = VOID
@@ -117,7 +117,7 @@ class PanopticQuality:
     def compute(self) -> dict:
         """pq, sq, rq, then pq_things and pq_stuff, and per class the three with tp, fp and fn.
 
-        A class that occurs nowhere is in no mean and not in `per_class`; a mean over nothing is NaN.
+        A class that occurs nowhere is in no mean nor in `per_class`; a mean over nothing is NaN.
         """
         present, quality = self.tally.present, 100 * self.tally.quality()
 

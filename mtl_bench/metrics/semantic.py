@@ -1,4 +1,4 @@
-"""Semantic IoU: one confusion matrix over all pixels of a split, mean over the classes that occur."""
+"""Semantic IoU: one confusion matrix over a split's pixels, mean over classes that occur."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -14,7 +14,11 @@ class Backbone(nn.Module):
     pyramid levels that will be read (deeper ones need not be built), and `pretrained`.
     """
 
-    mean: tuple[float, float, float] = (0.485, 0.456, 0.406)  # RGB in [0, 1], what it was trained with
+    mean: tuple[float, float, float] = (
+        0.485,
+        0.456,
+        0.406,
+    )  # RGB in [0, 1], what it was trained with
     std: tuple[float, float, float] = (0.229, 0.224, 0.225)
     channels: dict[int, int]  # stride -> channels
 
@@ -39,7 +43,9 @@ class TimmBackbone(Backbone):
         overlay = None
         if pretrained not in (None, "timm"):
             if not Path(str(pretrained)).is_file():
-                raise ValueError(f"no weights file '{pretrained}'; --pretrained takes 'timm' or a file")
+                raise ValueError(
+                    f"no weights file '{pretrained}'; --pretrained takes 'timm' or a file"
+                )
             overlay = {"file": str(pretrained)}
         levels = tuple(range(max(strides).bit_length() - 1))  # stride 2 is level 0
         self.pyramid = timm.create_model(

@@ -31,7 +31,9 @@ class Outputs:
 class Network(nn.Module):
     """What runs at inference. In training mode it also predicts the auxiliary depth maps."""
 
-    def __init__(self, backbone: Backbone, sizes: config.Network, classes: int, tasks: tuple[str, ...]):
+    def __init__(
+        self, backbone: Backbone, sizes: config.Network, classes: int, tasks: tuple[str, ...]
+    ):
         super().__init__()
         self.normalize = Normalize(backbone.mean, backbone.std)
         self.backbone = backbone
@@ -76,7 +78,9 @@ class Network(nn.Module):
         if "depth" in self.decoders:
             maps = self.decoders["depth"](pyramid, context)
             heads = list(self.heads["depth"])  # type: ignore[call-overload]
-            for features_BCHW, head in zip(maps, heads if self.training else heads[:1], strict=False):
+            for features_BCHW, head in zip(
+                maps, heads if self.training else heads[:1], strict=False
+            ):
                 inverse = head(features_BCHW).sigmoid() / self.min_depth
                 outputs.inverse_depth.append(_resize(inverse, size))
         return outputs

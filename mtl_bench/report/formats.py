@@ -1,13 +1,24 @@
 """The table as CSV, Markdown, LaTeX and on a terminal: the same numbers in four spellings."""
 
 import math
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from mtl_bench.report.tables import COLUMNS, Column, Entry, Group, Row, Table, tabulate, text
+from mtl_bench.report.notes import footnotes
+from mtl_bench.report.tables import (
+    BY_NAME,
+    COLUMNS,
+    SMOKE,
+    Column,
+    Entry,
+    Group,
+    Row,
+    Table,
+    measured,
+    tabulate,
+)
 
 if TYPE_CHECKING:
     import rich.table
@@ -25,6 +36,8 @@ TEX = {
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
 }
+ARROWS_TEX = {+1: r"$\uparrow$", -1: r"$\downarrow$"}
+IN_SUMMARY = ("pq", "abs_rel", "rmse", "fps")
 TITLES_TEX = {"delta1": r"$\delta_1$"}
 
 
@@ -32,12 +45,25 @@ def number(value: float, column: Column) -> str:
     return NOTHING if math.isnan(value) else f"{value:.{column.digits}f}"
 
 
-def entry(value: Entry, column: Column, seeds: int, plus_minus: str = f" {PLUS_MINUS} ") -> str:
-    """`33.1 +- 0.4`; with its own n where fewer seeds have the value than the line has."""
-    shown = number(value.mean, column)
-    if not math.isnan(value.std):
-        shown += plus_minus + number(value.std, column)
-    return shown + (f" (n={value.count})" if 0 < value.count < seeds else "")
+def halves(value: Entry, column: Column, seeds: int) -> tuple[str, str]:
+    """`33.1` and `+- 0.4`, with an n of its own where fewer seeds than the line's have a value.
+
+    What is the same for all seeds, such as a count of parameters, has no spread.
+    """
+    same = math.isnan(value.std) or value.std < 1e-9 * abs(value.mean)
+    spread = "" if same else f"{PLUS_MINUS} {number(value.std, column)}"
+    own = f"(n={value.count})" if 0 < value.count < seeds else ""
+    return number(value.mean, column), " ".join(filter(None, (spread, own)))
+
+
+def entry(value: Entry, column: Column, seeds: int) -> str:
+    return " ".join(filter(None, halves(value, column, seeds)))
+
+
+def single(row: Row, name: str) -> str:
+    """One cell's value of a column."""
+    column = BY_NAME[name]
+    return number(measured(row, column), column)
 
 
 def title(column: Column, arrows: dict[int, str] = ARROWS) -> str:
@@ -59,7 +85,7 @@ def csv(table: Table) -> str:
     """One line per group: identity, kind, n, then mean and standard deviation of every column."""
     lines: list[dict[str, Any]] = []
     for group in table.lines:
-        line = dict(zip(table.axes, group.identity, strict=True))
+        line: dict[str, Any] = dict(zip(table.axes, group.identity, strict=True))
         kind = "trivial" if group.status == "trivial" else "measured"
         line |= {"kind": kind, "mark": group.mark, "n": len(group.rows)}
         for column in COLUMNS:
@@ -78,46 +104,54 @@ def csv(table: Table) -> str:
 
 
 def markdown(table: Table) -> str:
-    """Quality and cost side by side in two tables, then what failed, what is published, the notes."""
+    """Quality and cost, then what has no numbers, what others published, and the notes."""
     parts = []
     if table.smoke:
-        parts.append("**Smoke: not a result.** These cells were trained for a few steps only.\n")
-    for heading, columns in _parts(table):
-        lines = [
-            [*group.identity, *_marked(group), seeds(group)]
-            + [_markdown_entry(group, column) for column in columns]
-            for group in table.lines
-        ]
-        notes = [f"{title(c)}<br>{c.note}" if c.note else title(c) for c in columns]
-        head = [*map(axis_title, table.axes), *_marked_title(table), "n", *notes]
-        parts.append(f"**{heading}**\n\n{_markdown_table(head, lines)}")
+        parts.append(f"**{SMOKE.capitalize()}.**")
+    for heading, columns in parts_of(table):
+        head = [f"{title(c)}<br>{c.note}" if c.note else title(c) for c in columns]
+        lines = []
+        for group in with_any(table, columns):
+            values = [(group.entries[c.name], c) for c in columns]
+            shown = [(entry(v, c, len(group.rows)), v.bold) for v, c in values]
+            lines.append([*group.names, seeds(group), *(f"**{t}**" if b else t for t, b in shown)])
+        names = [axis_title(axis) for axis in table.axes]
+        parts.append(f"**{heading}**\n\n{_grid([*names, 'n', *head], lines, len(names))}")
     if table.unfinished:
-        lines = [[c.label, c.status, c.reason] for c in table.unfinished]
-        parts.append(f"**Without numbers**\n\n{_markdown_table(['cell', 'status', 'why'], lines)}")
+        lines = [[cell.label, cell.status, cell.reason] for cell in table.unfinished]
+        parts.append(f"**Without numbers**\n\n{_grid(['cell', 'status', 'why'], lines, 3)}")
     for source in table.published:
-        head = [axis_title(table.axes[0]), "PQ", "RMSE (m)", "FPS"]
-        lines = [[row["name"], *(f"{row[k]:.1f}" for k in ("pq", "rmse", "fps"))] for row in source["rows"]]
-        heading = f"**{source['mark']}**: {source['source']}; {source['dataset']}, {source['gpu']}; {source['note']}"
-        parts.append(f"{heading}. Not comparable with the rows above.\n\n{_markdown_table(head, lines)}")
-    parts.append("\n".join(f"- {_prose(note)}" for note in table.footnotes))
-    return "\n".join(part.rstrip("\n") + "\n" for part in parts if part)
+        head = [axis_title(table.axes[0]), *(f"{name} {a}" for name, a in published_head())]
+        lines = [[row["name"], *published_values(row)] for row in source["rows"]]
+        parts.append(
+            f"**{source['mark']}**, not comparable with the rows above\n\n{_grid(head, lines, 1)}"
+        )
+        parts.append(f"{source['source']}: {source['dataset']}, {source['gpu']}, {source['note']}.")
+    parts.append("\n".join(f"- {pretty(note)}" for note in footnotes(table)))
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def latex(table: Table) -> str:
     """Tables for a paper: `\\input` it where booktabs and graphicx are loaded."""
-    parts = [r"% needs \usepackage{booktabs,graphicx}"]
-    if table.smoke:
-        parts.append("% SMOKE: not a result")
-    for heading, columns in _parts(table):
-        parts.append(_latex_measured(table, heading, columns))
+    parts = ["% needs \\usepackage{booktabs,graphicx}"]
+    notes = " ".join(footnotes(table))
+    for heading, columns in parts_of(table):
+        head = [f"{TITLES_TEX.get(c.name, tex(c.title))} {ARROWS_TEX[c.better]}" for c in columns]
+        units = [tex(column.note) for column in columns]
+        lines = []
+        for group in with_any(table, columns):
+            values = [_latex_entry(group.entries[c.name], c, len(group.rows)) for c in columns]
+            lines.append([*map(tex, group.names), seeds(group), *values])
+        blank = [""] * len(table.axes)
+        heads = [[*(tex(axis_title(a)) for a in table.axes), "n", *head], [*blank, "", *units]]
+        caption = f"{SMOKE.capitalize()}. " if table.smoke else ""
+        caption = f"{caption}{heading}. {notes}" if heading == "Quality" else f"{caption}{heading}."
+        parts.append(_float(heads, lines, len(table.axes), caption, fit=True))
     for source in table.published:
-        lines = [
-            f"{tex(row['name'])} & {row['pq']:.1f} & {row['rmse']:.1f} & {row['fps']:.1f} \\\\"
-            for row in source["rows"]
-        ]
-        head = f"{tex(axis_title(table.axes[0]))} & PQ $\\uparrow$ & RMSE $\\downarrow$ & FPS $\\uparrow$ \\\\"
-        caption = tex(f"{source['mark']}: {source['source']}. {source['note'].capitalize()}.")
-        parts.append(_latex_table("lrrr", [head], [lines], caption, fit=False))
+        head = [f"{name} {a}" for name, a in published_head(ARROWS_TEX)]
+        lines = [[tex(row["name"]), *published_values(row)] for row in source["rows"]]
+        caption = f"{source['mark']}. {source['source']}. {sentence(source['note'])}."
+        parts.append(_float([[axis_title(table.axes[0]), *head]], lines, 1, caption, fit=False))
     return "\n\n".join(parts) + "\n"
 
 
@@ -129,21 +163,22 @@ def tex(value: str) -> str:
 
 def summary_table(rows: Sequence[Row], axis: str = "backbone") -> "rich.table.Table":
     """The main columns for a terminal."""
+    import rich.box
     import rich.table
 
     table = tabulate(rows, axis)
-    columns = [c for c in table.columns() if c.name in ("pq", "miou", "abs_rel", "rmse", "fps", "train_min")]
-    shown = rich.table.Table(caption=" ".join(table.footnotes), caption_justify="left")
+    columns = [column for column in table.columns() if column.name in IN_SUMMARY]
+    shown = rich.table.Table(
+        box=rich.box.SIMPLE_HEAD, caption="depth is median-scaled; spread over n seeds"
+    )
     for name in (*map(axis_title, table.axes), "status"):
-        shown.add_column(name)
-    for name in ("n", *(f"{title(c)}{f' {c.note}' if c.note else ''}" for c in columns)):
-        shown.add_column(name, justify="right")
+        shown.add_column(name, overflow="fold")
+    for name in ("n", *(f"{title(column)}\n{_unit(column)}" for column in columns)):
+        shown.add_column(name, justify="right", no_wrap=True)
     for group in table.lines:
-        values = [entry(group.entries[c.name], c, len(group.rows)) for c in columns]
-        styled = [
-            f"[bold]{v}[/bold]" if group.entries[c.name].bold else v
-            for v, c in zip(values, columns, strict=True)
-        ]
+        values = [(group.entries[c.name], c) for c in columns]
+        texts = [(entry(v, c, len(group.rows)).replace(" ", ""), v.bold) for v, c in values]
+        styled = [f"[bold]{t}[/bold]" if bold else t for t, bold in texts]
         shown.add_row(*group.identity, group.mark or "done", seeds(group), *styled)
     for cell in table.unfinished:
         blank = [""] * (len(table.axes) - 1)
@@ -151,25 +186,78 @@ def summary_table(rows: Sequence[Row], axis: str = "backbone") -> "rich.table.Ta
     return shown
 
 
+def _unit(column: Column) -> str:
+    """The note without what the table's caption says."""
+    return column.note.replace("median-scaled", "").strip(", ")
+
+
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _parts(table: Table) -> list[tuple[str, list[Column]]]:
-    """Quality with the speed it is paid with, and all of the cost."""
+def parts_of(table: Table) -> list[tuple[str, list[Column]]]:
+    """Quality with the speed that pays for it, and the cost."""
     speed = [column for column in table.columns() if column.name == "fps"]
-    parts = [("Quality", table.columns("quality") + speed), ("Cost", table.columns("cost"))]
+    quality = table.columns("quality")
+    parts = [("Quality", quality and quality + speed), ("Cost", table.columns("cost"))]
     return [(heading, columns) for heading, columns in parts if columns]
 
 
-def _marked_title(table: Table) -> list[str]:
-    return ["mark"] if any(group.mark for group in table.lines) else []
+def with_any(table: Table, columns: Sequence[Column]) -> list[Group]:
+    """The lines that have a value in one of these columns."""
+    return [g for g in table.lines if any(g.entries[column.name].count for column in columns)]
 
 
-def _marked(group: Group) -> list[str]:
-    raise NotImplementedError
+def sentence(words: str) -> str:
+    return words[:1].upper() + words[1:]
 
 
-def _markdown_entry(group: Group, column: Column) -> str:
-    value = group.entries[column.name]
-    shown = entry(value, column, len(group.rows))
-    return f"**{shown}**" if value.bold else shown
+def pretty(note: str) -> str:
+    return note.replace("+-", PLUS_MINUS)
+
+
+def published_head(arrows: dict[int, str] = ARROWS) -> list[tuple[str, str]]:
+    return [("PQ", arrows[+1]), ("RMSE (m)", arrows[-1]), ("FPS", arrows[+1])]
+
+
+def published_values(row: Row) -> list[str]:
+    return [f"{row[name]:.1f}" for name in ("pq", "rmse", "fps")]
+
+
+def _grid(head: Sequence[str], lines: Sequence[Sequence[str]], left: int) -> str:
+    """A Markdown table whose first `left` columns are text."""
+    rule = ["---" if i < left else "---:" for i in range(len(head))]
+    escaped = [[cell.replace("|", r"\|") for cell in line] for line in (head, rule, *lines)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
+
+
+def _latex_entry(value: Entry, column: Column, count: int) -> str:
+    mean, spread = halves(value, column, count)
+    mean = rf"\textbf{{{mean}}}" if value.bold else mean
+    spread = spread.replace(PLUS_MINUS, r"$\pm$")
+    return mean + (rf"{{\scriptsize\,{spread}}}" if spread else "")
+
+
+def _float(
+    heads: Sequence[Sequence[str]],
+    lines: Sequence[Sequence[str]],
+    left: int,
+    caption: str,
+    fit: bool,
+) -> str:
+    """A LaTeX table; `fit` shrinks it to the width of the text."""
+    columns = "l" * left + "r" * (len(heads[0]) - left)
+    body = [" & ".join(line) + r" \\" for line in lines]
+    tabular = [
+        rf"\begin{{tabular}}{{{columns}}}",
+        r"\toprule",
+        *(" & ".join(line) + r" \\" for line in heads),
+        r"\midrule",
+        *body,
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+    if fit:
+        tabular = [r"\resizebox{\textwidth}{!}{%", *tabular[:-1], tabular[-1] + "}"]
+    return "\n".join(
+        [r"\begin{table}", r"\centering", *tabular, rf"\caption{{{tex(caption)}}}", r"\end{table}"]
+    )

@@ -7,8 +7,8 @@ measured, trivial and published values.
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,13 @@ import pandas as pd
 LITERATURE = Path(__file__).parent / "literature.toml"
 SHOWN = ("done", "stale")  # statuses that have numbers
 SMOKE = "smoke: not a result"
-PERCENT = 100.0
+NOT_NUMBERS = (  # keys of a cell that change no number
+    "seed",  # nor which group it is in
+    "recipe.about",
+    "recipe.data.cache",
+    "recipe.data.workers",
+    "recipe.optim.checkpoint_every",
+)
 Row = Mapping[str, Any]
 
 
@@ -36,10 +42,10 @@ class Column:
 
 
 COLUMNS = (
-    Column("pq", "PQ", "panoptic.pq", +1, 1, PERCENT, note="%"),
-    Column("pq_things", "PQ things", "panoptic.pq_things", +1, 1, PERCENT, note="%"),
-    Column("pq_stuff", "PQ stuff", "panoptic.pq_stuff", +1, 1, PERCENT, note="%"),
-    Column("miou", "mIoU", "semantic.miou", +1, 1, PERCENT, note="%"),
+    Column("pq", "PQ", "panoptic.pq", +1, 1, note="%"),
+    Column("pq_things", "PQ things", "panoptic.pq_things", +1, 1, note="%"),
+    Column("pq_stuff", "PQ stuff", "panoptic.pq_stuff", +1, 1, note="%"),
+    Column("miou", "mIoU", "semantic.miou", +1, 1, note="%"),
     Column("abs_rel", "AbsRel", "depth_median.abs_rel", -1, 3, note="median-scaled"),
     Column("rmse", "RMSE", "depth_median.rmse", -1, 2, note="m, median-scaled"),
     Column("delta1", "delta1", "depth_median.delta1", +1, 3, note="median-scaled"),
@@ -76,14 +82,19 @@ class Group:
     entries: Mapping[str, Entry]
 
     @property
-    def label(self) -> str:
-        return ", ".join(self.identity) + (" (stale)" if self.status == "stale" else "")
-
-    @property
     def mark(self) -> str:
         """What a reader must know before reading the numbers; empty for a plain result."""
-        marks = {"stale": "stale", "trivial": "trivial predictor"}
-        return "; ".join(filter(None, (marks.get(self.status), SMOKE if self.smoke else None)))
+        marks = ("stale" if self.status == "stale" else "", SMOKE if self.smoke else "")
+        return "; ".join(filter(None, marks))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The identity with the mark beside it."""
+        return (self.identity[0] + (f" ({self.mark})" if self.mark else ""), *self.identity[1:])
+
+    @property
+    def label(self) -> str:
+        return ", ".join(filter(None, self.names))
 
 
 @dataclass(frozen=True)
@@ -92,7 +103,7 @@ class Unfinished:
 
     label: str
     slug: str
-    status: str  # failed | interrupted | missing
+    status: str  # failed | interrupted | running | missing | skipped
     reason: str
 
 
@@ -103,7 +114,6 @@ class Table:
     baseline: Group | None
     unfinished: tuple[Unfinished, ...]
     published: tuple[Mapping[str, Any], ...]
-    footnotes: tuple[str, ...] = field(default=())
 
     @property
     def lines(self) -> tuple[Group, ...]:
@@ -118,7 +128,8 @@ class Table:
         return [
             column
             for column in COLUMNS
-            if part in (None, column.part) and any(g.entries[column.name].count for g in self.groups)
+            if part in (None, column.part)
+            and any(g.entries[column.name].count for g in self.groups)
         ]
 
 
@@ -136,7 +147,7 @@ def tabulate(rows: Sequence[Row], axis: str = "backbone", baseline: Row | None =
     groups = _groups(shown, cells, axes)
     trivial = None
     if baseline is not None:
-        entries = {c.name: Entry(_number(baseline, c), count=1) for c in COLUMNS}
+        entries = {c.name: Entry(measured(baseline, c), count=1) for c in COLUMNS}
         entries = {k: Entry() if math.isnan(e.mean) else e for k, e in entries.items()}
         name = ("trivial predictor", *("" for _ in axes[1:]))
         trivial = Group(name, "trivial", False, (), entries)
@@ -145,9 +156,10 @@ def tabulate(rows: Sequence[Row], axis: str = "backbone", baseline: Row | None =
         axes=axes,
         groups=tuple(groups),
         baseline=trivial,
-        unfinished=tuple(_unfinished(r, axes) for r in rows if r.get("status", "done") not in SHOWN),
+        unfinished=tuple(
+            _unfinished(r, axes) for r in rows if r.get("status", "done") not in SHOWN
+        ),
         published=published(axis),
-        footnotes=tuple(_footnotes(groups, trivial)),
     )
 
 
@@ -190,9 +202,7 @@ def _cell(row: Row) -> dict[str, Any]:
             flat.setdefault(name, row[name])
     if "recipe" in row and "recipe.name" not in flat:
         flat["recipe.name"] = row["recipe"]
-    flat.pop("seed", None)
-    flat.pop("recipe.about", None)
-    return flat
+    return {key: value for key, value in flat.items() if key not in NOT_NUMBERS}
 
 
 def _axes(cells: list[dict[str, Any]], axis: str) -> tuple[str, ...]:
@@ -212,16 +222,20 @@ def _groups(rows: list[Row], cells: list[dict[str, Any]], axes: tuple[str, ...])
     frame = pd.DataFrame(
         {
             "group": [
-                json.dumps([cell, row.get("status", "done"), bool(row.get("smoke"))], sort_keys=True)
+                json.dumps(
+                    [cell, row.get("status", "done"), bool(row.get("smoke"))], sort_keys=True
+                )
                 for cell, row in zip(cells, rows, strict=True)
             ],
-            **{column.name: [_number(row, column) for row in rows] for column in COLUMNS},
+            **{column.name: [measured(row, column) for row in rows] for column in COLUMNS},
         }
     )
     groups = []
     for _, members in frame.groupby("group", sort=False):
         values = members[[column.name for column in COLUMNS]]
-        summary = pd.DataFrame({"mean": values.mean(), "std": values.std(), "count": values.count()})
+        summary = pd.DataFrame(
+            {"mean": values.mean(), "std": values.std(), "count": values.count()}
+        )
         first = rows[members.index[0]]
         groups.append(
             Group(
@@ -238,7 +252,7 @@ def _groups(rows: list[Row], cells: list[dict[str, Any]], axes: tuple[str, ...])
     return groups
 
 
-def _number(row: Row, column: Column) -> float:
+def measured(row: Row, column: Column) -> float:
     """A row's value in the column's unit; NaN where it has none."""
     value = row.get("metric", {}).get(column.key)
     if value is None:
@@ -282,24 +296,3 @@ def _unfinished(row: Row, axes: tuple[str, ...]) -> Unfinished:
         status=str(row["status"]),
         reason=lines[-1] if lines else "no numbers yet",
     )
-
-
-def _footnotes(groups: list[Group], trivial: Group | None) -> Iterable[str]:
-    if any(len(group.rows) > 1 for group in groups):
-        yield (
-            "Mean +- sample standard deviation over n seeds. Bold: ahead of every other line by more "
-            "than either's spread. Stale, smoke, trivial and published lines take no part."
-        )
-    if any(len(group.rows) == 1 for group in groups):
-        yield "n = 1: one seed has no spread, so no lead over it or by it can be told from chance: not bold."
-    if any(0 < e.count < len(g.rows) for g in groups for e in g.entries.values()):
-        yield "A number with its own n is the mean over those seeds that have the value."
-    if trivial:
-        yield (
-            "Trivial predictor: the training split's mean depth image and most frequent class per "
-            "pixel. It looks at no image; a network has to beat it."
-        )
-    if any(group.status == "stale" for group in groups):
-        yield "Stale: the code changed after these cells ran; run again with --rerun stale."
-    if any(group.smoke for group in groups):
-        yield "Smoke: a few training steps that show that the pipeline works. Not a result."

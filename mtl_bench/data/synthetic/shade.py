@@ -106,13 +106,13 @@ def surface(
     albedo *= np.clip(1 + 0.75 * noise, 0.25, 1.9)[:, None]
     shade = np.clip((normal * light.sun_3).sum(1), 0, 1)[:, None]
     sky_share = 0.72 - 0.28 * normal[:, 1:2]  # surfaces that look up see more of the sky
-    contact = _contact(shadows, world_N3, kind)[:, None]
+    contact = _contact(shadows, world_N3)[:, None]
     color = albedo * (light.ambient_3 * sky_share + light.sun_color_3 * shade) * contact
     air = 1 - np.exp(-depth_N / np.float32(light.haze_m))[:, None]
     return color + (light.horizon_3 * 0.9 - color) * air
 
 
-def _contact(shadows: FloatArray, world_N3: FloatArray, kind: NDArray) -> FloatArray:
+def _contact(shadows: FloatArray, world_N3: FloatArray) -> FloatArray:
     """Darkening of the ground under vehicles and people: 1 = none."""
     dark = np.ones(len(world_N3), np.float32)
     ground = np.flatnonzero(world_N3[:, 1] > -0.2)

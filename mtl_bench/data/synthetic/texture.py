@@ -228,11 +228,10 @@ def _coach(s: Patch) -> FloatArray:
 
 def _sign(s: Patch) -> FloatArray:
     """Red ring, blue arrow, yellow diamond, red-white no-entry, or a blue-white board."""
-    half = s.half_N3[:, :2].max(1)
-    x, y = s.p_N3[:, 0] / s.half_N3[:, 0], s.p_N3[:, 1] / s.half_N3[:, 1]
-    disc = np.abs(s.half_N3[:, 1] - s.half_N3[:, 0]) > 0.01 * half  # a lying cylinder: axis is y
-    disc &= s.half_N3[:, 1] < 0.1
-    y = np.where(disc, s.p_N3[:, 2] / s.half_N3[:, 2], y)
+    half = s.half_N3[:, 0]
+    disc = s.half_N3[:, 1] < 0.1  # a cylinder whose axis, its own y, points along the street
+    unit = s.p_N3 / s.half_N3
+    x, y = np.where(disc, unit[:, 2], unit[:, 0]), np.where(disc, unit[:, 0], unit[:, 1])
     w = s.footprint_N / half
     radius = np.where(disc, np.sqrt(x * x + y * y), np.maximum(np.abs(x), np.abs(y)))
     inner, bar = band(radius, -1, 0.68, w), band(np.abs(y), -1, 0.22, w) * band(np.abs(x), -1, 0.7, w)

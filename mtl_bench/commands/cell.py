@@ -1,0 +1,142 @@
+"""`train` and `evaluate`: one cell."""
+
+import json
+import traceback
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mtl_bench.commands import options as o
+from mtl_bench.config import TASKS, Cell, load_recipe, override
+
+
+def register(app: typer.Typer) -> None:
+    panel = "One cell"
+    app.command(
+        rich_help_panel=panel,
+        epilog="Example: mtl-bench train --backbone NAME --method NAME --set recipe.optim.lr=3e-4",
+    )(train)
+    app.command(rich_help_panel=panel, epilog="Example: mtl-bench evaluate runs/NAME --split val")(
+        evaluate
+    )
+
+
+def train(
+    cell_file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[CELL.JSON]",
+            help="A cell that was run before, to run exactly it again; the options below that name "
+            "a cell do not apply then.",
+            show_default=False,
+        ),
+    ] = None,
+    recipe: Annotated[str, typer.Option(metavar="NAME|FILE", help="How to train.")] = "small",
+    backbone: Annotated[
+        str | None, typer.Option(metavar="NAME", help="See `list`.", show_default=False)
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="See `list`.", show_default=False)
+    ] = None,
+    tasks: Annotated[str, typer.Option(help="Separated by commas.")] = ",".join(TASKS),
+    seed: Annotated[int, typer.Option(help="Of initial weights, data order and method.")] = 0,
+    settings: o.SetOption = None,
+    pretrained: o.PretrainedOption = None,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Forget an earlier result or checkpoint.")
+    ] = False,
+    data: o.DataOption = None,
+    runs: o.RunsOption = Path("runs"),
+    device: o.DeviceOption = o.Device.auto,
+    wandb: o.WandbOption = o.Wandb.off,
+    plugins: o.PluginsOption = None,
+    quiet: o.QuietOption = False,
+) -> None:
+    """Train one cell, evaluate it, time it, and write its row."""
+    if cell_file is not None:
+        from mtl_bench import results
+
+        cell = results.load_cell(cell_file)
+    else:
+        if backbone is None or method is None:
+            raise ValueError("say which cell: --backbone NAME and --method NAME, or a cell.json")
+        names = tuple(word.strip() for word in tasks.split(",") if word.strip())
+        weights = o.weights(pretrained)
+        cell = Cell(load_recipe(recipe), backbone, method, names, seed, pretrained=weights)
+    run(override(cell, settings or []), data, runs, device.value, wandb.value, rerun, quiet)
+
+
+def run(
+    cell: Cell, data: Path | None, runs: Path, device: str, wandb: str, rerun: bool, quiet: bool
+) -> None:
+    """Claim a cell and run what is left of it; a failure is written down before it is raised."""
+    from mtl_bench import claim, launch, plugins, results
+
+    plugins.check_cells([cell])
+    directory = results.run_dir(cell, runs)
+    state = results.inspect(cell, runs)
+    if state.row is not None and not rerun:
+        stale = f", but stale: {state.why}" if state.word == "stale" else ""
+        typer.echo(f"done already{stale} (--rerun runs it again): {directory}/row.json")
+        return
+    root = o.data_root(cell, data, quiet)
+
+    def echo(line: str) -> None:
+        if not quiet:
+            typer.echo(line)
+
+    try:
+        with claim.claim(directory):
+            if rerun:
+                results.clear(directory)
+            _, dropped = results.begin(cell, runs)
+            if dropped:
+                echo(f"starting over, as what the checkpoint was made with is no more: {dropped}")
+            _run_recorded(cell, directory, root, device, wandb, echo)
+    except claim.ClaimedError as error:
+        typer.echo(f"mtl-bench: {error}", err=True)
+        raise typer.Exit(launch.CLAIMED) from None
+    echo(f"{directory}/row.json")
+
+
+def _run_recorded(
+    cell: Cell, directory: Path, root: Path, device: str, wandb: str, echo: Any
+) -> None:
+    """Run; whatever ends it early other than an interruption is left in `failed.json`."""
+    from mtl_bench import results
+
+    try:
+        from mtl_bench.run import run_cell
+
+        run_cell(cell, directory, root, device, wandb, echo)
+    except Exception as error:
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+        results.write_failure(directory, line, traceback.format_exc())
+        raise
+
+
+def evaluate(
+    what: Annotated[
+        Path, typer.Argument(metavar="RUN|CHECKPOINT", help="A folder in runs/, or its last.pt.")
+    ],
+    split: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="In place of the recipe's.", show_default=False),
+    ] = None,
+    data: o.DataOption = None,
+    device: o.DeviceOption = o.Device.auto,
+    plugins: o.PluginsOption = None,
+) -> None:
+    """Evaluate a trained cell again and print its metrics as JSON; its row stays as it is."""
+    from mtl_bench import results
+
+    if not what.exists():
+        raise ValueError(f"no run or checkpoint '{what}'")
+    directory, checkpoint = (what, what / "last.pt") if what.is_dir() else (what.parent, what)
+    cell = results.load_cell(directory / "cell.json")
+    root = o.data_root(cell, data)
+    from mtl_bench.run import reevaluate
+
+    evaluation = reevaluate(cell, checkpoint, root, device.value, split)
+    typer.echo(json.dumps(evaluation.metrics, indent=1))

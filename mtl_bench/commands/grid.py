@@ -1,0 +1,252 @@
+"""`ablate`, `status` and `report`: a grid of cells."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mtl_bench.commands import options as o
+from mtl_bench.config import Cell, to_dict
+
+if TYPE_CHECKING:
+    from mtl_bench.grids import Grid
+
+
+class Rerun(StrEnum):
+    stale = "stale"
+    failed = "failed"
+    all = "all"
+
+
+def register(app: typer.Typer) -> None:
+    panel = "A grid of cells"
+    app.command(
+        rich_help_panel=panel,
+        epilog="Example: mtl-bench ablate --grid backbones --seeds 3 --jobs 2",
+    )(ablate)
+    app.command(rich_help_panel=panel, epilog="Example: mtl-bench status --grid backbones")(status)
+    app.command(rich_help_panel=panel, epilog="Example: mtl-bench report --grid backbones")(report)
+
+
+def ablate(
+    grid: o.GridOption,
+    recipe: o.RecipeOption = None,
+    seeds: o.SeedsOption = None,
+    smoke: o.SmokeOption = False,
+    settings: o.SetOption = None,
+    pretrained: o.PretrainedOption = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would run, and run nothing.")
+    ] = False,
+    jobs: Annotated[
+        int,
+        typer.Option("--jobs", metavar="N", min=1, help="Cells at a time; they share the cores."),
+    ] = 1,
+    rerun: Annotated[
+        Rerun | None,
+        typer.Option(
+            "--rerun",
+            help="stale: run cells again whose code has changed. failed: begin failed ones at step "
+            "0, not at their checkpoint. all: run every cell again.",
+            show_default=False,
+        ),
+    ] = None,
+    data: o.DataOption = None,
+    runs: o.RunsOption = Path("runs"),
+    reports: o.ReportsOption = Path("reports"),
+    device: o.DeviceOption = o.Device.auto,
+    wandb: o.WandbOption = o.Wandb.off,
+    plugins: o.PluginsOption = None,
+    quiet: o.QuietOption = False,
+) -> None:
+    """Run what a grid still lacks, then write its report.
+
+    Cells that are done are reused, interrupted and failed ones tried again.
+    """
+    from mtl_bench import launch
+    from mtl_bench.plugins import check_cells
+
+    chosen = _load(grid, recipe, seeds, smoke, settings, pretrained)
+    check_cells(chosen.cells)
+    todo = launch.to_run(chosen.cells, runs, rerun)
+    if not quiet or dry_run:
+        _announce(chosen, todo, runs)
+    if dry_run:
+        typer.echo("nothing was run (--dry-run)")
+        return
+    options = ["--device", device.value, "--wandb", wandb.value]
+    if todo:
+        _run(todo, runs, data, options, jobs, rerun, quiet)
+    _baseline(chosen, data, runs, quiet)
+    page = _write(chosen, runs, reports)
+    words = [row["status"] for row in _rows(chosen, runs)]
+    bad = sum(word not in ("done", "stale") for word in words)
+    if bad or not quiet:
+        typer.echo(f"{len(words) - bad} of {len(words)} cells done; report: {page}")
+    if bad:
+        raise typer.Exit(1)
+
+
+def status(
+    grid: o.GridOption,
+    recipe: o.RecipeOption = None,
+    seeds: o.SeedsOption = None,
+    smoke: o.SmokeOption = False,
+    settings: o.SetOption = None,
+    pretrained: o.PretrainedOption = None,
+    runs: o.RunsOption = Path("runs"),
+    plugins: o.PluginsOption = None,
+) -> None:
+    """List a grid's cells: done, stale, failed, interrupted, running or missing."""
+    from mtl_bench import launch, results
+    from mtl_bench.display import headline, label
+
+    chosen = _load(grid, recipe, seeds, smoke, settings, pretrained)
+    lines = []
+    for cell in chosen.cells:
+        state = results.inspect(cell, runs)
+        about = "  ".join(filter(None, (state.why, headline(state.row or {}))))
+        lines.append([state.word, label(cell), str(results.run_dir(cell, runs)), about])
+    for line in o.columns(lines):
+        typer.echo(line)
+    for skip in chosen.skips:
+        typer.echo(f"  skipped: {label(skip.cell)}: {skip.why}")
+    typer.echo(launch.summary(chosen.cells, runs))
+
+
+def report(
+    grid: o.GridOption,
+    recipe: o.RecipeOption = None,
+    seeds: o.SeedsOption = None,
+    smoke: o.SmokeOption = False,
+    settings: o.SetOption = None,
+    pretrained: o.PretrainedOption = None,
+    runs: o.RunsOption = Path("runs"),
+    reports: o.ReportsOption = Path("reports"),
+    plugins: o.PluginsOption = None,
+) -> None:
+    """Write a grid's tables, plots and page from the rows that there are."""
+    chosen = _load(grid, recipe, seeds, smoke, settings, pretrained)
+    if not any("metric" in row for row in _rows(chosen, runs)):
+        raise ValueError(
+            f"no cell of grid '{chosen.name}' is done in '{runs}': mtl-bench ablate --grid {grid}"
+        )
+    typer.echo(str(_write(chosen, runs, reports)))
+
+
+# --- steps ----------------------------------------------------------------------------------------
+
+
+def _load(
+    grid: str,
+    recipe: str | None,
+    seeds: int | None,
+    smoke: bool,
+    settings: list[str] | None,
+    pretrained: str | None,
+) -> "Grid":
+    from mtl_bench.grids import load_grid
+
+    return load_grid(
+        grid,
+        recipe=recipe,
+        seeds=seeds,
+        smoke=smoke,
+        settings=settings or [],
+        pretrained=o.weights(pretrained),
+    )
+
+
+def _announce(grid: "Grid", todo: Sequence[Cell], runs: Path) -> None:
+    from mtl_bench import launch
+    from mtl_bench.display import label
+
+    size = grid.recipe.data
+    product = " x ".join(
+        f"{len(values)} {axis}{'s' * (len(values) > 1)}" for axis, values in grid.axes.items()
+    )
+    typer.echo(f"{grid.name}: {grid.question}")
+    typer.echo(
+        f"{len(grid.cells)} cells = {product}, less {len(grid.skips)} skipped; recipe "
+        f"{grid.recipe.name} ({size.dataset}, {size.height}x{size.width}, "
+        f"{grid.recipe.optim.steps} steps)"
+    )
+    hours = launch.hours_to_run(len(todo), grid.cells, runs)
+    about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
+    typer.echo(f"  {launch.summary(grid.cells, runs)}   to run {len(todo)}{about}")
+    for skip in grid.skips:
+        typer.echo(f"  skipped: {label(skip.cell)}: {skip.why}")
+
+
+def _run(
+    todo: Sequence[Cell],
+    runs: Path,
+    data: Path | None,
+    options: list[str],
+    jobs: int,
+    rerun: str | None,
+    quiet: bool,
+) -> None:
+    """Render what is missing first, once, so that cells side by side find it; then run them."""
+    from mtl_bench import display, launch
+
+    roots = {cell.recipe.data: o.data_root(cell, data, quiet) for cell in todo}
+    passed_on = [*options, *(["--quiet"] if quiet else [])]
+
+    def command(cell: Cell) -> list[str]:
+        return launch.cell_command(cell, runs, roots[cell.recipe.data], passed_on)
+
+    with display.choose(len(todo), quiet) as shown:
+        launch.Launcher(runs, command, shown, jobs, rerun).run(todo)
+
+
+def _rows(grid: "Grid", runs: Path) -> list[dict[str, Any]]:
+    from mtl_bench import results
+
+    return results.rows(grid.cells, runs)
+
+
+def _write(grid: "Grid", runs: Path, reports: Path) -> Path:
+    from mtl_bench import report as reporting
+
+    file = _baseline_file(grid, runs)
+    baseline = json.loads(file.read_text()) if file is not None and file.is_file() else None
+    command = f"mtl-bench ablate --grid {grid.name.removesuffix('-smoke')}"
+    return reporting.build(
+        grid,
+        _rows(grid, runs),
+        reports / grid.name,
+        runs_root=runs,
+        baseline=baseline,
+        command=command + (" --smoke" if grid.name.endswith("-smoke") else ""),
+    )
+
+
+def _baseline(grid: "Grid", data: Path | None, runs: Path, quiet: bool) -> None:
+    """Measure the trivial predictors once for the grid's data set; a table shows them."""
+    from mtl_bench import results
+
+    file = _baseline_file(grid, runs)
+    if file is None or file.is_file():
+        return
+    from mtl_bench.baselines import baselines
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    root = o.data_root(grid.cells[0], data, quiet)
+    results.write_json(file, baselines(grid.cells[0], root, file.parent).metrics)
+
+
+def _baseline_file(grid: "Grid", runs: Path) -> Path | None:
+    """Where they are kept; None for a grid over several data sets or protocols."""
+    settings = {
+        json.dumps([to_dict(cell.recipe.data), to_dict(cell.recipe.evaluate)])
+        for cell in grid.cells
+    }
+    if len(settings) != 1:
+        return None
+    key = hashlib.sha256(settings.pop().encode()).hexdigest()[:12]
+    return runs / "baselines" / f"trivial-{key}.json"

@@ -1,0 +1,133 @@
+"""`list`, `new`, `check` and `env`: what there is, adding to it, and where it runs."""
+
+import textwrap
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mtl_bench.commands import options as o
+
+
+class What(StrEnum):
+    all = "all"
+    methods = "methods"
+    backbones = "backbones"
+    recipes = "recipes"
+    grids = "grids"
+
+
+class Kind(StrEnum):
+    method = "method"
+    backbone = "backbone"
+
+
+def register(app: typer.Typer) -> None:
+    panel = "Around"
+    app.command("list", rich_help_panel=panel, epilog="Example: mtl-bench list methods -v")(show)
+    app.command(rich_help_panel=panel, epilog="Example: mtl-bench new method mine")(new)
+    app.command(rich_help_panel=panel, epilog="Example: mtl-bench check mine")(check)
+    app.command(rich_help_panel=panel, epilog="Example: mtl-bench env")(env)
+
+
+def show(
+    what: Annotated[What, typer.Argument(help="What to list.")] = What.all,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="With files and whole descriptions.")
+    ] = False,
+    plugins: o.PluginsOption = None,
+) -> None:
+    """List methods, backbones, recipes and grids, without importing any."""
+    for kind in What if what is What.all else [what]:
+        if kind is What.all:
+            continue
+        if what is What.all:
+            typer.echo(f"{kind.value}")
+        for line in _lines(kind.value, verbose):
+            typer.echo(line)
+
+
+def _lines(kind: str, verbose: bool) -> list[str]:
+    from mtl_bench import config, grids
+    from mtl_bench.plugins import describe
+
+    if kind == "recipes":
+        return o.columns([[name, config.load_recipe(name).about] for name in config.recipe_names()])
+    if kind == "grids":
+        return o.columns([[name, grids.question_of(name)] for name in grids.grid_names()])
+    found = describe(kind)
+    if not verbose:
+        return o.columns([[d.name, f"BROKEN: {d.error}" if d.error else d.summary] for d in found])
+    lines = []
+    for d in found:
+        lines += [f"  {d.name}  ({d.path})"]
+        lines += [f"    BROKEN: {d.error}"] if d.error else []
+        lines += [textwrap.indent(d.doc.rstrip(), "    "), ""]
+    return lines
+
+
+def new(
+    kind: Annotated[Kind, typer.Argument(help="What to write.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Lower-case letters, digits and _.")],
+    folder: Annotated[
+        Path | None,
+        typer.Option("--dir", metavar="DIR", help="Where. [default: ./methods or ./backbones]"),
+    ] = None,
+) -> None:
+    """Write a commented file to start a method or a backbone from; it passes `check` as it is."""
+    from mtl_bench.scaffold import write
+
+    path = write(f"{kind.value}s", name, folder)
+    where = "" if folder is None else f" --plugins {folder}"
+    typer.echo(f"{path}\nnext: edit it, then: mtl-bench check {path if folder else name}")
+    typer.echo(f"it is found as: mtl-bench list {kind.value}s{where}")
+
+
+def check(
+    names: Annotated[
+        list[str],
+        typer.Argument(metavar="NAME|FILE...", help="Methods or backbones, by name or by file."),
+    ],
+    plugins: o.PluginsOption = None,
+) -> None:
+    """Run the tests that every plug-in has to pass; exit code 1 if one fails."""
+    from mtl_bench.plugins import KINDS, add_folder, did_you_mean, files, kinds_of
+
+    chosen = []
+    for word in names:
+        name = word
+        if word.endswith(".py"):
+            add_folder(word)
+            name = Path(word).stem
+        kinds = kinds_of(name)
+        if not kinds and word.endswith(".py"):
+            raise ValueError(
+                f"{word} is neither: a method imports mtl_bench.method, a backbone mtl_bench.model"
+            )
+        if not kinds:
+            known = [known for kind in KINDS for known in files(kind)]
+            raise ValueError(f"no method or backbone called '{name}'{did_you_mean(name, known)}")
+        chosen += [(kind, name) for kind in kinds]
+    from mtl_bench.check import check as check_plugin
+
+    failed = 0
+    for kind, name in chosen:
+        typer.echo(f"{kind[:-1]} {name}")
+        results = check_plugin(kind, name)
+        failed += sum(not result.ok for result in results)
+        for line in o.columns([["ok" if r.ok else "FAILED", r.name, r.detail] for r in results]):
+            typer.echo(line)
+    if failed:
+        typer.echo(f"{failed} checks failed", err=True)
+        raise typer.Exit(1)
+
+
+def env(device: o.DeviceOption = o.Device.auto) -> None:
+    """Print versions, hardware and code as they would stand in a row."""
+    from mtl_bench.engine import choose_device
+    from mtl_bench.provenance import environment, harness_fingerprint
+
+    values = {**environment(choose_device(device.value)), "harness": harness_fingerprint()}
+    for line in o.columns([[key, str(value)] for key, value in values.items()], indent=""):
+        typer.echo(line)

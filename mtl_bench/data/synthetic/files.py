@@ -1,0 +1,198 @@
+"""Writes scenes as Cityscapes would: one folder tree, one set of file names, one set of encodings.
+
+Under `<type>/<split>/<city>/<city>_<sequence>_<frame>_`: leftImg8bit and, with every frame of the
+snippet, leftImg8bit_sequence; gtFine (instanceIds, labelIds, panoptic), disparity, camera, vehicle.
+Beyond Cityscapes, `egomotion/` holds the exact relative camera poses.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtl_bench.data.labels import CITYSCAPES19
+from mtl_bench.data.synthetic import render
+from mtl_bench.data.synthetic.camera import BASELINE_M, FRAMES_PER_S, FloatArray, context_from_target
+
+SPLITS = ("train", "val", "test")
+_CITY_SCENES = 50
+_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 2]
+_SUPERCATEGORIES = (
+    "flat", "flat", "construction", "construction", "construction", "object", "object", "object",
+    "nature", "nature", "sky", "human", "human", *["vehicle"] * 6,
+)  # fmt: skip
+_CATEGORIES = [
+    {"id": x.label_id, "name": x.name, "color": x.color, "supercategory": s, "isthing": int(x.is_thing)}
+    for x, s in zip(CITYSCAPES19.labels, _SUPERCATEGORIES, strict=True)
+]
+_EVALUATED = {label.label_id: label for label in CITYSCAPES19.labels}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the bytes of a data set depend on."""
+
+    height: int
+    width: int
+    train_scenes: int
+    val_scenes: int
+    test_scenes: int
+    seed: int
+    frames: int
+    annotated: int  # index of the frame that has labels
+    min_instance_area: int  # visible pixels below which a thing is written as a group
+    renderer_version: int = render.RENDERER_VERSION
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError: sizes or counts that cannot be rendered."""
+        if self.height < 16 or self.width < 16:
+            raise ValueError(f"{self.height}x{self.width} is too small to render; use 16x16 or more")
+        if not 0 <= self.annotated < self.frames:
+            raise ValueError(f"annotated frame {self.annotated} is not among {self.frames} frames")
+        if min(self.counts) < 0 or sum(self.counts) == 0:
+            raise ValueError(f"cannot render {self.counts} scenes; give counts >= 0, one of them > 0")
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        return self.train_scenes, self.val_scenes, self.test_scenes
+
+    @property
+    def scenes(self) -> list[tuple[int, int]]:
+        """(split, scene) of all scenes in a fixed order."""
+        return [(split, i) for split, count in enumerate(self.counts) for i in range(count)]
+
+    @property
+    def key(self) -> str:
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:12]
+
+    def place(self, split: int, scene: int) -> tuple[str, str]:
+        """City and `<city>_<sequence>`; no city has scenes of two splits."""
+        before = sum(-(-count // _CITY_SCENES) for count in self.counts[:split])
+        city = f"syn{before + scene // _CITY_SCENES:02d}"
+        return city, f"{city}_{scene % _CITY_SCENES:06d}"
+
+
+def encode_disparity(depth_m: FloatArray, fx: float, baseline_m: float = BASELINE_M) -> NDArray[np.uint16]:
+    """Cityscapes' uint16 disparity of a depth map: round(256 d) + 1 with d = baseline fx / depth.
+
+    0 = invalid: no depth, or a disparity that 16 bits cannot hold.
+    """
+    valid = depth_m > 0
+    steps = np.round(256.0 * baseline_m * fx / np.where(valid, depth_m, 1.0))
+    return np.where(valid & (steps > 0) & (steps < 65535), steps + 1, 0).astype(np.uint16)
+
+
+def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict[str, Any]:
+    """Render and write one scene; returns its entries of the split's panoptic JSON."""
+    scene = render.draw_scene(
+        (settings.seed, split, number), settings.height, settings.width, settings.frames, settings.annotated
+    )
+    name = SPLITS[split]
+    city, stem = settings.place(split, number)
+
+    def path(kind: str, frame: int, ending: str) -> Path:
+        folder = root / kind / name / city
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder / f"{stem}_{frame:06d}_{ending}"
+
+    target = settings.annotated
+    for frame in range(settings.frames):
+        image = render.image(scene, frame)
+        _write_png(path("leftImg8bit_sequence", frame, "leftImg8bit.png"), image)
+        if frame == target:
+            _write_png(path("leftImg8bit", frame, "leftImg8bit.png"), image)
+    seen = render.truth(scene, target)
+    ids = render.instance_ids(seen, settings.min_instance_area)
+    _write_png(path("gtFine", target, "gtFine_instanceIds.png"), ids)
+    _write_png(path("gtFine", target, "gtFine_labelIds.png"), seen.label_HW)
+    disparity = encode_disparity(seen.depth_HW, scene.camera.fx)
+    _write_png(path("disparity", target, "disparity.png"), disparity)
+    for kind, values in (("camera", _camera(scene)), ("vehicle", _vehicle(scene)), ("egomotion", _egomotion(scene))):
+        text = json.dumps(values, indent=4, sort_keys=True)
+        path(kind, target, f"{kind}.json").write_text(text + "\n")
+    image_id = f"{stem}_{target:06d}"
+    picture, entries = panoptic(ids, image_id)
+    folder = root / "gtFine" / f"cityscapes_panoptic_{name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_png(folder / f"{image_id}_gtFine_panoptic.png", picture)
+    return {"split": split, "sort": f"{city}/{stem}", **entries}
+
+
+def panoptic(ids_HW: NDArray[np.uint16], image_id: str) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    """COCO-style panoptic image [H,W,3] (id = R + 256 G) and its JSON entries."""
+    picture = np.zeros((*ids_HW.shape, 3), np.uint8)
+    segments = []
+    for number in np.unique(ids_HW).tolist():
+        group = number < 1000
+        label = _EVALUATED.get(number if group else number // 1000)
+        if label is None:
+            continue
+        mask = ids_HW == number
+        picture[mask] = (number % 256, number // 256, 0)
+        rows, cols = np.flatnonzero(mask.any(1)).tolist(), np.flatnonzero(mask.any(0)).tolist()
+        box = [cols[0], rows[0], cols[-1] - cols[0] + 1, rows[-1] - rows[0] + 1]
+        segments.append({"id": number, "category_id": label.label_id, "area": int(mask.sum()),
+                         "bbox": box, "iscrowd": int(group and label.is_thing)})  # fmt: skip
+    height, width = ids_HW.shape
+    entry = {"id": image_id, "width": width, "height": height, "file_name": f"{image_id}_gtFine_leftImg8bit.png"}
+    annotation = {"image_id": image_id, "file_name": f"{image_id}_gtFine_panoptic.png", "segments_info": segments}
+    return picture, {"image": entry, "annotation": annotation}
+
+
+def write_summary(root: Path, settings: Settings, entries: list[dict[str, Any]]) -> None:
+    """The panoptic JSON of every split, and what the data set was made from."""
+    for split, name in enumerate(SPLITS):
+        own = sorted((e for e in entries if e["split"] == split), key=lambda e: e["sort"])
+        if own:
+            content = {
+                "images": [e["image"] for e in own],
+                "annotations": [e["annotation"] for e in own],
+                "categories": _CATEGORIES,
+            }
+            text = json.dumps(content, sort_keys=True, indent=4)
+            (root / "gtFine" / f"cityscapes_panoptic_{name}.json").write_text(text)
+    (root / "synthetic.json").write_text(json.dumps(asdict(settings), indent=4) + "\n")
+
+
+def _write_png(path: Path, image: NDArray) -> None:
+    if not cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, _FAST):
+        raise OSError(f"cannot write {path}")
+
+
+def _camera(scene: render.Scene) -> dict[str, dict[str, float]]:
+    """Extrinsics in the ISO 8855 vehicle frame (x forward, y left, z up; metres and radians)."""
+    camera = scene.camera
+    return {
+        "extrinsic": {
+            "baseline": BASELINE_M, "pitch": scene.motion.pitch_rad, "roll": 0.0, "x": 1.7, "y": 0.0,
+            "yaw": 0.0, "z": camera.mount_m,
+        },
+        "intrinsic": {"fx": camera.fx, "fy": camera.fy, "u0": camera.u0, "v0": camera.v0},
+    }  # fmt: skip
+
+
+def _vehicle(scene: render.Scene) -> dict[str, float]:
+    """Odometry; ISO 8855 counts yaw to the left as positive."""
+    return {
+        "gpsHeading": 0.0, "gpsLatitude": 0.0, "gpsLongitude": 0.0, "outsideTemperature": 20.0,
+        "speed": scene.motion.step_m * FRAMES_PER_S,
+        "yawRate": -scene.motion.yaw_step_rad * FRAMES_PER_S,
+    }  # fmt: skip
+
+
+def _egomotion(scene: render.Scene) -> dict[str, Any]:
+    """4x4 matrices T, X_context = T X_target, camera axes (x right, y down, z forward), metres."""
+    poses, target = scene.motion.poses, scene.annotated
+
+    def transform(frame: int) -> list[list[float]] | None:
+        if not 0 <= frame < len(poses):
+            return None
+        matrix: list[list[float]] = context_from_target(poses[target], poses[frame]).tolist()
+        return matrix
+
+    return {"previous": transform(target - 1), "next": transform(target + 1)}

@@ -1,0 +1,437 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from cityscapes_tree import (
+    CAMERA,
+    HEIGHT,
+    WIDTH,
+    file,
+    instance_ids,
+    open_tree,
+    put_png,
+    write_frame,
+    write_tree,
+)
+
+from mtl_bench import config
+from mtl_bench.data.check import check
+from mtl_bench.data.cityscapes_files import read_instance_ids
+from mtl_bench.data.labels import CITYSCAPES20, IGNORE
+from mtl_bench.data.targets import panoptic_targets
+
+NAME = "aachen_000000_000019"
+PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
+
+
+@pytest.fixture
+def tree(tmp_path):
+    return write_tree(tmp_path)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def rgb(path):
+    return torch.from_numpy(cv2.imread(str(path))[..., ::-1].copy()).permute(2, 0, 1) / 255
+
+
+# --- what a sample holds --------------------------------------------------------------------------
+
+
+def test_training_sample_without_changes_shows_the_files(tree):
+    dataset = open_tree(tree, augment=PLAIN)
+    assert dataset.names == [
+        "aachen_000000_000019",
+        "aachen_000002_000019",
+        "bochum_000001_000019",
+    ]
+    sample = dataset.sample(0, generator())
+    assert sample.names == [NAME]
+    expected = rgb(file(tree, "leftImg8bit", NAME, "leftImg8bit.png"))
+    assert torch.equal(sample.image_B3HW, expected)
+    assert torch.equal(sample.clean_B3HW, expected)
+    for place, frame in enumerate(("000018", "000020")):
+        path = file(tree, "leftImg8bit_sequence", f"aachen_000000_{frame}", "leftImg8bit.png")
+        assert torch.equal(sample.context_BN3HW[place], rgb(path))
+    torch.testing.assert_close(
+        sample.K_B33, torch.tensor([[2262.52, 0, 16.98], [0, 2265.3, 8.137], [0, 0, 1]])
+    )
+    assert sample.camera_height_m_B.item() == pytest.approx(1.22)
+    assert sample.instance_ids_BHW is None
+    assert sample.depth_m_BHW is None
+
+    ids = instance_ids()
+    masked = np.isin(ids, [1, 23])
+    assert np.array_equal(sample.reprojection_mask_BHW.numpy(), ~masked)
+    targets = panoptic_targets(ids.astype(np.int32), CITYSCAPES20, dataset.loss)
+    assert np.array_equal(sample.semantic_BHW.numpy(), targets.semantic)
+    assert np.array_equal(sample.semantic_weight_BHW.numpy(), targets.semantic_weight)
+    assert np.array_equal(sample.center_B1HW[0].numpy(), targets.center)
+    assert np.array_equal(sample.center_weight_B1HW[0].numpy(), targets.center_weight)
+    assert np.array_equal(sample.offset_B2HW.numpy(), targets.offset)
+    assert np.array_equal(sample.offset_weight_B1HW[0].numpy(), targets.offset_weight)
+    assert targets.offset_weight.sum() == 24
+
+
+def test_padding_counts_nowhere(tree):
+    dataset = open_tree(tree, augment=config.Augment(crop=(HEIGHT + 4, WIDTH + 6)))
+    sample = dataset.sample(0, generator())
+    assert sample.image_B3HW.shape == (3, HEIGHT + 4, WIDTH + 6)
+    assert (sample.semantic_weight_BHW > 0).sum() == HEIGHT * WIDTH
+    outside = sample.semantic_weight_BHW == 0
+    assert (sample.semantic_BHW[outside] == IGNORE).all()
+    assert not sample.reprojection_mask_BHW[outside].any()
+    assert (sample.center_weight_B1HW[0][outside] == 0).all()
+    assert (sample.offset_weight_B1HW[0][outside] == 0).all()
+
+
+def test_evaluation_sample(tree):
+    for augment in (None, config.Augment()):
+        sample = open_tree(tree, augment=augment).sample(0, None)
+        expected = rgb(file(tree, "leftImg8bit", NAME, "leftImg8bit.png"))
+        assert torch.equal(sample.image_B3HW, expected)
+        assert np.array_equal(sample.instance_ids_BHW.numpy(), instance_ids())
+        assert sample.instance_ids_BHW.dtype == torch.int32
+        assert sample.depth_m_BHW.dtype == torch.float32
+        assert sample.depth_m_BHW[5, 5].item() == pytest.approx(23.678742, abs=1e-5)
+        assert sample.depth_m_BHW[0, :2].tolist() == [0, 0]
+        assert sample.context_BN3HW is None
+        assert sample.semantic_BHW is None
+
+
+def test_large_frames_shrink_and_ground_truth_keeps_its_size(tmp_path):
+    write_frame(tmp_path, NAME, size=(4 * HEIGHT, 2 * WIDTH))
+    dataset = open_tree(tmp_path, augment=PLAIN)
+    sample = dataset.sample(0, generator())
+    original = rgb(file(tmp_path, "leftImg8bit", NAME, "leftImg8bit.png"))
+    area = original.reshape(3, HEIGHT, 4, WIDTH, 2).mean((2, 4))
+    torch.testing.assert_close(sample.image_B3HW, area, atol=1 / 255, rtol=0)
+    assert sample.context_BN3HW.shape == (2, 3, HEIGHT, WIDTH)
+    assert sample.semantic_BHW.shape == (HEIGHT, WIDTH)
+    assert (sample.semantic_BHW[0] == CITYSCAPES20.index("sky")).all()
+    expected = [[2262.52 / 2, 0, (16.98 + 0.5) / 2 - 0.5], [0, 2265.3 / 4, (8.137 + 0.5) / 4 - 0.5]]
+    torch.testing.assert_close(sample.K_B33[:2], torch.tensor(expected))
+
+    evaluated = dataset.sample(0, None)
+    assert evaluated.image_B3HW.shape == (3, HEIGHT, WIDTH)
+    assert torch.equal(evaluated.K_B33, sample.K_B33)
+    assert evaluated.instance_ids_BHW.shape == (4 * HEIGHT, 2 * WIDTH)
+    assert evaluated.depth_m_BHW[5, 5].item() == pytest.approx(23.678742, abs=1e-5)  # own fx
+
+
+def test_shrunk_labels_are_those_in_the_middle(tmp_path):
+    write_frame(tmp_path, NAME, size=(3 * HEIGHT, 3 * WIDTH))
+    ids = np.full((3 * HEIGHT, 3 * WIDTH), 7, np.uint16)
+    ids[1::3, 1::3] = 26003
+    put_png(file(tmp_path, "gtFine", NAME, "gtFine_instanceIds.png"), ids)
+    sample = open_tree(tmp_path, augment=PLAIN).sample(0, generator())
+    assert (sample.semantic_BHW == CITYSCAPES20.index("car")).all()
+    assert (sample.offset_weight_B1HW == 1).all()
+
+
+def test_each_task_reads_only_its_files(tree):
+    for folder in ("leftImg8bit_sequence", "disparity"):
+        (tree / folder).rename(tree / f"away_{folder}")
+    panoptic = open_tree(tree, video=False)
+    sample = panoptic.sample(0, generator())
+    assert sample.context_BN3HW is None
+    assert sample.clean_B3HW is None
+    assert sample.reprojection_mask_BHW is None
+    assert sample.semantic_BHW is not None
+    assert panoptic.sample(0, None).depth_m_BHW is None
+
+    for folder in ("leftImg8bit_sequence", "disparity"):
+        (tree / f"away_{folder}").rename(tree / folder)
+    (tree / "gtFine").rename(tree / "away_gtFine")
+    depth = open_tree(tree, panoptic=False)
+    sample = depth.sample(0, generator())
+    assert sample.semantic_BHW is None
+    assert sample.reprojection_mask_BHW.all()
+    assert depth.sample(0, None).instance_ids_BHW is None
+
+    (tree / "away_gtFine").rename(tree / "gtFine")
+    sample = open_tree(tree, panoptic=False, augment=PLAIN).sample(0, generator())
+    assert sample.semantic_BHW is None
+    assert not sample.reprojection_mask_BHW[0].any()  # sky
+
+
+def test_evaluation_needs_no_neighbours(tree):
+    for path in (tree / "leftImg8bit_sequence").rglob("*.png"):
+        path.unlink()
+    assert open_tree(tree, augment=None).sample(1, None).depth_m_BHW is not None
+
+
+def test_cache_changes_nothing_and_saves_reading(tree):
+    data = config.Data(height=HEIGHT, width=WIDTH, cache=False)
+    cached, fresh = open_tree(tree), open_tree(tree, data=data)
+    first = cached.sample(0, generator(4))
+    for path in tree.rglob(f"{NAME[:14]}*"):
+        path.rename(path.with_suffix(".away"))
+    second = cached.sample(0, generator(4))
+    with pytest.raises(ValueError, match="cannot be read"):
+        fresh.sample(0, generator(4))
+    with pytest.raises(ValueError, match="cannot be read"):
+        cached.uncached().sample(0, generator(4))
+    assert torch.equal(first.image_B3HW, second.image_B3HW)
+    assert torch.equal(first.center_B1HW, second.center_B1HW)
+
+
+def test_each_frame_has_its_own_camera(tree):
+    other = json.loads(json.dumps(CAMERA))
+    other["intrinsic"]["fx"], other["extrinsic"]["z"] = 1000.0, 2.0
+    file(tree, "camera", "aachen_000002_000019", "camera.json").write_text(json.dumps(other))
+    dataset = open_tree(tree, augment=PLAIN)
+    samples = [dataset.sample(index, generator()) for index in range(3)]
+    assert [s.K_B33[0, 0].item() for s in samples] == pytest.approx([2262.52, 1000, 2262.52])
+    assert samples[1].camera_height_m_B.item() == 2
+
+
+def test_labelled_sequence_frames_join_the_training(tree, tmp_path_factory):
+    pseudo = tmp_path_factory.mktemp("pseudo")
+    for frame, value in ((17, 7), (18, 7), (19, 7), (20, 7), (21, 7)):
+        name = f"aachen_000000_{frame:06d}"
+        image = np.full((HEIGHT, WIDTH, 3), frame, np.uint8)
+        if frame != 19:
+            put_png(file(tree, "leftImg8bit_sequence", name, "leftImg8bit.png"), image)
+        path = pseudo / "aachen" / f"{name}_gtFine_instanceIds.png"
+        put_png(path, np.full((HEIGHT, WIDTH), value, np.uint16))
+    dataset = open_tree(tree, sequence_labels=pseudo, augment=PLAIN)
+    assert dataset.names == [
+        "aachen_000000_000018",
+        "aachen_000000_000019",
+        "aachen_000000_000020",
+        "aachen_000002_000019",
+        "bochum_000001_000019",
+    ]
+    later = dataset.sample(2, generator())
+    assert torch.equal(later.image_B3HW, torch.full((3, HEIGHT, WIDTH), 20.0) / 255)
+    assert torch.equal(later.context_BN3HW[1], torch.full((3, HEIGHT, WIDTH), 21.0) / 255)
+    assert (later.semantic_BHW == CITYSCAPES20.index("road")).all()
+    assert later.K_B33[0, 0].item() == pytest.approx(2262.52)
+    human = dataset.sample(1, generator())
+    assert (human.semantic_BHW == CITYSCAPES20.index("car")).any()
+
+
+# --- what can be wrong ----------------------------------------------------------------------------
+
+
+def one_line(error):
+    return "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("folder", "name", "suffix", "what"),
+    [
+        ("leftImg8bit_sequence", "aachen_000000_000020", "leftImg8bit.png", "neighbour frames"),
+        ("gtFine", NAME, "gtFine_instanceIds.png", "label files"),
+        ("camera", NAME, "camera.json", "camera files"),
+    ],
+)
+def test_missing_files_are_named_before_training(tree, folder, name, suffix, what):
+    path = file(tree, folder, name, suffix)
+    path.unlink()
+    with pytest.raises(ValueError, match=rf"{path}: missing, one of 1 {what}.*{folder}_") as error:
+        open_tree(tree)
+    assert one_line(error)
+    report = check(tree)
+    assert [str(problem) for problem in report.problems] == [
+        f"{path}: missing; unpack {folder}_trainvaltest.zip"
+    ]
+
+
+def test_first_frame_of_a_video_has_no_previous_one(tree):
+    write_frame(tree, "aachen_000005_000001")
+    path = file(tree, "leftImg8bit_sequence", "aachen_000005_000001", "leftImg8bit.png")
+    new = "aachen_000005_000000"
+    for folder, suffix in (
+        ("leftImg8bit", "leftImg8bit.png"),
+        ("camera", "camera.json"),
+        ("gtFine", "gtFine_instanceIds.png"),
+    ):
+        old = file(tree, folder, "aachen_000005_000001", suffix)
+        old.rename(file(tree, folder, new, suffix))
+    assert path.exists()
+    with pytest.raises(ValueError, match=r"aachen_000005_-00001_leftImg8bit\.png: missing"):
+        open_tree(tree)
+    assert any("000005_-00001" in str(problem) for problem in check(tree).problems)
+
+
+def test_missing_disparity_is_named_before_evaluation(tree):
+    path = file(tree, "disparity", NAME, "disparity.png")
+    path.unlink()
+    with pytest.raises(ValueError, match=f"{path}: missing"):
+        open_tree(tree, augment=None)
+
+
+BROKEN = [
+    ("leftImg8bit", "leftImg8bit.png", np.zeros((HEIGHT, WIDTH, 3), np.uint16), "16-bit PNG"),
+    ("gtFine", "gtFine_instanceIds.png", np.zeros((HEIGHT, WIDTH), np.uint8), "8-bit PNG where 16"),
+    ("gtFine", "gtFine_instanceIds.png", np.full((8, 9), 7, np.uint16), "8x9 pixels, but"),
+    ("disparity", "disparity.png", np.zeros((HEIGHT, WIDTH), np.uint8), "8-bit PNG where 16"),
+    ("disparity", "disparity.png", np.zeros((8, 9), np.uint16), "8x9 pixels, but"),
+]
+
+
+@pytest.mark.parametrize(("folder", "suffix", "array", "message"), BROKEN)
+def test_wrong_contents(tree, folder, suffix, array, message):
+    path = file(tree, folder, NAME, suffix)
+    put_png(path, array)
+    with pytest.raises(ValueError, match=f"{path}: {message}") as error:
+        open_tree(tree).sample(0, None)
+    assert one_line(error)
+    assert [str(problem) for problem in check(tree).problems] == [str(error.value)]
+
+
+def test_neighbour_of_another_size(tree):
+    path = file(tree, "leftImg8bit_sequence", "aachen_000000_000018", "leftImg8bit.png")
+    put_png(path, np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8))
+    with pytest.raises(ValueError, match=f"{path}: 16x33 pixels, but"):
+        open_tree(tree).sample(0, generator())
+
+
+@pytest.mark.parametrize("value", [34, 500, 999, 34000, 65535])
+def test_unknown_label_id(tree, value):
+    path = file(tree, "gtFine", NAME, "gtFine_instanceIds.png")
+    ids = instance_ids()
+    ids[3, 4:6] = value
+    put_png(path, ids)
+    message = f"{path}: unknown instance id {value} on 2 pixels"
+    with pytest.raises(ValueError, match=message):
+        open_tree(tree).sample(0, generator())
+    assert check(tree).problems == []
+    deep = check(tree, deep=True).problems
+    assert len(deep) == 1
+    assert str(deep[0]).startswith(message)
+
+
+def test_every_known_label_id_is_accepted(tmp_path):
+    values = [*range(34), 26000, 26999, 33001, 29000]
+    path = tmp_path / "a.png"
+    put_png(path, np.array([values], np.uint16))
+    assert read_instance_ids(path).tolist() == [values]
+
+
+@pytest.mark.parametrize("keep", [0, 4, 20, 40, 0.5, -1, -12, -16])
+def test_truncated_png(tree, keep):
+    path = file(tree, "leftImg8bit", NAME, "leftImg8bit.png")
+    data = path.read_bytes()
+    keep = int(keep * len(data)) if isinstance(keep, float) else keep
+    path.write_bytes(data[:keep])
+    message = "truncated PNG|empty|not a PNG"
+    with pytest.raises(ValueError, match=f"{path}: .*({message})") as error:
+        open_tree(tree).sample(0, None)
+    assert one_line(error)
+    assert [problem.group for problem in check(tree).problems] == ["bad"]
+
+
+def test_damaged_png(tree):
+    path = file(tree, "leftImg8bit", NAME, "leftImg8bit.png")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=f"{path}: damaged PNG"):
+        open_tree(tree).sample(0, None)
+    assert check(tree).problems == []  # the header is in order
+    assert "damaged PNG" in str(check(tree, deep=True).problems[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{}", "no 'intrinsic'"),
+        ("{", "not a camera file"),
+        ('{"intrinsic": 3, "extrinsic": 4}', "not a camera file"),
+        (json.dumps({**CAMERA, "intrinsic": {**CAMERA["intrinsic"], "fx": 0}}), "impossible"),
+        (json.dumps({**CAMERA, "extrinsic": {"baseline": 0.2}}), "no 'z'"),
+    ],
+)
+def test_broken_camera(tree, text, message):
+    path = file(tree, "camera", NAME, "camera.json")
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"{path}: {message}") as error:
+        open_tree(tree).sample(0, None)
+    assert one_line(error)
+    assert [str(problem) for problem in check(tree).problems] == [str(error.value)]
+
+
+def test_frames_smaller_than_the_recipe(tree):
+    with pytest.raises(ValueError, match="16x32 pixels, fewer than the recipe's 32x64"):
+        open_tree(tree, data=config.Data(height=32, width=64)).sample(0, None)
+
+
+def test_no_data_set_at_all(tmp_path):
+    for look in (open_tree, check):
+        with pytest.raises(ValueError, match="no such folder"):
+            look(tmp_path / "nowhere")
+        with pytest.raises(ValueError, match="expected Cityscapes' layout"):
+            look(tmp_path)
+    put_png(tmp_path / "leftImg8bit/train/a/strange_leftImg8bit.png", np.zeros((2, 2), np.uint8))
+    with pytest.raises(ValueError, match="'strange' is no frame's name"):
+        check(tmp_path)
+
+
+def test_a_folder_that_cannot_be_listed(tree, monkeypatch):
+    def deny(folder):
+        raise PermissionError(13, "Permission denied", str(folder))
+
+    monkeypatch.setattr("mtl_bench.data.cityscapes_files.os.scandir", deny)
+    with pytest.raises(ValueError, match="leftImg8bit/train: cannot be listed"):
+        check(tree)
+
+
+# --- check ----------------------------------------------------------------------------------------
+
+
+def test_check_of_a_sound_tree(tree):
+    write_tree(tree, 2, "val")
+    report = check(tree, deep=True)
+    assert report.problems == []
+    assert report.frames == {"train": 3, "val": 2}
+    assert report.present["train", "leftImg8bit_sequence"] == 6
+    assert report.summary() == [
+        str(tree),
+        "train: 3 frames (Cityscapes: 2975), 3 label files, 6 neighbour frames, 3 camera files, "
+        "3 disparity maps",
+        "val: 2 frames (Cityscapes: 500), 2 label files, 4 neighbour frames, 2 camera files, "
+        "2 disparity maps",
+        "panoptic training: ready",
+        "depth training: ready",
+        "panoptic evaluation: ready",
+        "depth evaluation: ready",
+    ]
+
+
+def test_check_lists_everything_at_once(tree):
+    write_tree(tree, 5, "val")
+    for path in (tree / "leftImg8bit_sequence" / "val").rglob("*_000018_*"):
+        path.unlink()
+    file(tree, "camera", NAME, "camera.json").unlink()
+    put_png(
+        file(tree, "gtFine", NAME, "gtFine_instanceIds.png"), np.zeros((HEIGHT, WIDTH), np.uint8)
+    )
+    for path in (tree / "disparity").rglob("*.png"):
+        path.unlink()
+    report = check(tree)
+    lines = report.summary()
+    assert len(report.problems) == 7
+    assert "val: 5 missing neighbour frames" in lines
+    assert "  and 2 more" in lines
+    assert "train: 1 missing camera file" in lines
+    assert "train: 1 bad label file" in lines
+    assert report.obstacle("panoptic training") == "2 problems"
+    assert report.obstacle("depth training") == "1 problem"
+    assert report.obstacle("panoptic evaluation") is None
+    absent = "no disparity/val; unpack disparity_trainvaltest.zip"
+    assert report.obstacle("depth evaluation") == absent
+    assert f"depth evaluation: {absent}" in lines
+
+
+def test_check_without_a_split(tree):
+    report = check(tree)
+    assert report.frames == {"train": 3, "val": 0}
+    assert "val: none" in report.summary()
+    assert report.obstacle("panoptic evaluation") == "no frames in leftImg8bit/val"

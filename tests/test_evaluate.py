@@ -1,0 +1,310 @@
+"""Evaluation, trivial predictors and export, on a tiny tree and models that know the truth."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from cityscapesscripts.evaluation import evalPanopticSemanticLabeling as csEval
+from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
+from torch import nn
+
+from mtl_bench.baselines import baselines
+from mtl_bench.config import Cell, Data, Evaluate, Loss, Recipe
+from mtl_bench.data.labels import CITYSCAPES20, IGNORE
+from mtl_bench.data.targets import panoptic_targets
+from mtl_bench.evaluate import evaluate
+from mtl_bench.export_predictions import export_predictions
+from mtl_bench.model import Outputs
+
+HEIGHT, WIDTH, FRAMES = 64, 128, 5
+FOCAL, BASELINE, CAMERA_M = 115.0, 0.5, 1.4
+CPU = torch.device("cpu")
+CELL = Cell(
+    Recipe(
+        data=Data(dataset="cityscapes", height=HEIGHT, width=WIDTH),
+        loss=Loss(center_sigma=3),
+        evaluate=Evaluate(stuff_area=0, nms_kernel=5),
+    ),
+    backbone="none",
+    method="none",
+)
+
+
+def scene(index):
+    """Instance ids and disparity of a street: sky, road, ego vehicle, and cars that move."""
+    ids = np.full((HEIGHT, WIDTH), 23, np.uint16)
+    ids[32:] = 7
+    ids[60:] = 1
+    rows = (np.arange(HEIGHT)[:, None] - (HEIGHT - 1) / 2).repeat(WIDTH, 1)
+    disparity = np.where(ids == 23, 0, rows.clip(1) * BASELINE / CAMERA_M)  # of a flat road
+    for number in range(2):
+        top, left = 28 + 4 * number, 10 + 12 * index + 40 * number
+        box = np.s_[top : top + 12, left : left + 16]
+        ids[box] = 26000 + number
+        disparity[box] = disparity[top + 11, 0]
+    return ids, np.where(disparity > 0, np.round(disparity * 256) + 1, 0).astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Frames of one gray level each, by which the models recognise them; train equals val."""
+    root = tmp_path_factory.mktemp("tree")
+    camera = {
+        "extrinsic": {"baseline": BASELINE, "z": CAMERA_M},
+        "intrinsic": {"fx": FOCAL, "fy": FOCAL, "u0": (WIDTH - 1) / 2, "v0": (HEIGHT - 1) / 2},
+    }
+    for split in ("train", "val"):
+        for index in range(FRAMES):
+            ids, disparity = scene(index)
+            write(root, split, index, "leftImg8bit", np.full((*ids.shape, 3), index, np.uint8))
+            write(root, split, index, "gtFine", ids, "_gtFine_instanceIds")
+            write(root, split, index, "disparity", disparity)
+            path = file_of(root, split, index, "camera", "_camera.json")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(camera))
+    return root
+
+
+def file_of(root: Path, split: str, index: int, folder: str, suffix: str) -> Path:
+    return root / folder / split / "aachen" / f"aachen_{index:06d}_000019{suffix}"
+
+
+def write(root, split, index, folder, array, suffix=None):
+    path = file_of(root, split, index, folder, f"{suffix or '_' + folder}.png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), array)
+
+
+class Oracle(nn.Module):
+    """Outputs made of the truth, at the input's size; depth in a unit of its own."""
+
+    def __init__(self, cell, unit=3.0, change=None):
+        super().__init__()
+        self.cell, self.unit, self.change = cell, unit, change
+        self.weight = nn.Parameter(torch.ones(1))
+        self.frozen = nn.BatchNorm2d(1).eval()
+        self.net = self.answer
+
+    def answer(self, image_B3HW):
+        assert not self.training
+        assert torch.is_inference_mode_enabled()
+        step = HEIGHT // image_B3HW.shape[2]
+        parts = [self.frame(round(image[0, 0, 0].item() * 255), step) for image in image_B3HW]
+        outputs = Outputs()
+        if "panoptic" in self.cell.tasks:
+            names = ("semantic_BCHW", "center_B1HW", "offset_B2HW")
+            for name, maps in zip(
+                names, zip(*[part[:3] for part in parts], strict=True), strict=True
+            ):
+                setattr(outputs, name, torch.stack(maps))
+        if "depth" in self.cell.tasks:
+            outputs.inverse_depth = [torch.stack([part[3] for part in parts])]
+        return self.change(outputs) if self.change else outputs
+
+    def frame(self, index, step):
+        ids, stored = (array[step // 2 :: step, step // 2 :: step] for array in scene(index))
+        targets = panoptic_targets(ids.astype(np.int32), CITYSCAPES20, self.cell.recipe.loss)
+        classes = torch.from_numpy(np.where(targets.semantic == IGNORE, 0, targets.semantic))
+        logits = nn.functional.one_hot(classes, len(CITYSCAPES20)).permute(2, 0, 1).float()
+        depth_m = BASELINE * FOCAL * 256 / np.maximum(stored.astype(np.float32) - 1, 1e-3)
+        inverse = torch.from_numpy(self.unit / np.where(stored > 0, depth_m, 1000))
+        center, offset = torch.from_numpy(targets.center)[None], torch.from_numpy(targets.offset)
+        return logits, center, offset, inverse[None]
+
+
+def run(cell, root, **changes):
+    return evaluate(Oracle(cell, **changes), cell, root, CPU, batch_size=2)
+
+
+def test_the_truth_scores_perfectly(root):
+    model, calls = Oracle(CELL).train(), []
+    model.frozen.eval()
+    result = evaluate(
+        model, CELL, root, CPU, batch_size=2, progress=lambda *call: calls.append(call)
+    )
+    metrics = result.metrics
+    for name in ("panoptic.pq", "panoptic.pq_things", "panoptic.pq_stuff", "semantic.miou"):
+        assert metrics[name] == 100.0
+    assert metrics["panoptic.class.car.pq"] == metrics["semantic.class.road.iou"] == 100.0
+    assert metrics["depth_median.abs_rel"] == pytest.approx(0, abs=1e-6)
+    assert metrics["depth_median.delta1"] == 1.0
+    assert metrics["depth_dgc.abs_rel"] == pytest.approx(0, abs=0.01)  # disparity in 1/256 pixel
+    assert metrics["dgc.to_median"] == pytest.approx(1, abs=0.01)
+    assert metrics["dgc.failed"] == metrics["dgc.fallback"] == 0
+    assert metrics["depth_median.images"] == metrics["depth_dgc.images"] == FRAMES
+    assert all(np.isfinite(value) for value in metrics.values())
+
+    assert calls == [(2, 5), (4, 5), (5, 5)]
+    assert model.training
+    assert not model.frozen.training
+    assert model.weight.grad is None
+
+    assert result.protocol["frames"] == FRAMES
+    assert result.protocol["split"] == "val"
+    assert result.protocol["ignored_classes"] == ["ego vehicle"]
+    assert result.protocol["depth_range_m"] == [0.001, 80.0]
+    json.dumps(result.protocol)
+
+
+def test_samples_are_spread_over_the_split(root):
+    samples = run(CELL, root).samples
+    assert samples["names"] == [f"aachen_{i:06d}_000019" for i in (0, 1, 3, 4)]
+    assert samples["image"].shape == (4, HEIGHT, WIDTH, 3)
+    assert samples["image"][:, 0, 0, 0].tolist() == [0, 1, 3, 4]
+    truth = np.where(samples["true_instance_ids"] == 1, 0, samples["true_instance_ids"])
+    assert np.array_equal(samples["instance_ids"] > 26000, truth > 25999)
+    assert samples["depth_m"].dtype == np.float16
+    valid = (samples["true_depth_m"] > 0) & (samples["true_depth_m"] < 60)
+    np.testing.assert_allclose(samples["depth_m"][valid], samples["true_depth_m"][valid], rtol=1e-2)
+
+
+def test_one_task_has_no_numbers_of_the_other(root):
+    panoptic = run(replace(CELL, tasks=("panoptic",)), root)
+    assert panoptic.metrics["panoptic.pq"] == 100.0
+    assert not [key for key in panoptic.metrics if key.startswith(("depth", "dgc"))]
+    assert set(panoptic.samples) == {"names", "image", "instance_ids", "true_instance_ids"}
+
+    depth = run(replace(CELL, tasks=("depth",)), root)
+    assert depth.metrics["dgc.fallback"] == FRAMES  # the road from normals
+    assert depth.metrics["depth_dgc.rmse"] == pytest.approx(0, abs=0.5)
+    assert not [key for key in depth.metrics if key.startswith(("panoptic", "semantic"))]
+    assert set(depth.samples) == {"names", "image", "depth_m", "true_depth_m"}
+
+
+def test_frames_without_ground_are_counted_not_averaged(root):
+    def wall(outputs):
+        outputs.inverse_depth[0][0] = 0.1  # the first frame of each batch
+        return outputs
+
+    cell = replace(CELL, tasks=("depth",))
+    metrics = run(cell, root, change=wall).metrics
+    assert metrics["dgc.failed"] == 3
+    assert metrics["depth_dgc.images"] == 2
+    assert metrics["depth_median.images"] == FRAMES
+    assert metrics["depth_dgc.abs_rel"] == pytest.approx(0, abs=0.01)
+    assert metrics["depth_median.abs_rel"] > 0.1
+
+    def walls(outputs):
+        outputs.inverse_depth[0][:] = 0.1
+        return outputs
+
+    metrics = run(cell, root, change=walls).metrics
+    assert metrics["dgc.failed"] == FRAMES
+    assert metrics["depth_dgc.images"] == 0
+    assert "depth_dgc.rmse" not in metrics
+
+
+def test_smaller_inputs_are_compared_at_the_size_of_the_truth(root):
+    data = replace(CELL.recipe.data, height=HEIGHT // 2, width=WIDTH // 2)
+    cell = replace(CELL, recipe=replace(CELL.recipe, data=data))
+    result = run(cell, root)
+    assert result.protocol["input"] == [32, 64]
+    assert result.protocol["compared_at"] == [64, 128]
+    assert result.samples["image"].shape[1:] == (HEIGHT, WIDTH, 3)
+    assert result.metrics["panoptic.class.car.pq"] > 75  # without scaled offsets: below 60
+    assert result.metrics["panoptic.class.car.rq"] == 100.0
+    assert result.metrics["dgc.to_median"] == pytest.approx(1, abs=0.03)
+
+
+def test_depth_that_is_not_finite_is_an_error(root):
+    def broken(outputs):
+        outputs.inverse_depth[0][0, 0, 3, 3] = torch.nan
+        return outputs
+
+    with pytest.raises(ValueError, match="not finite in a frame of \\['aachen_000000_000019'"):
+        run(CELL, root, change=broken)
+
+
+# --- trivial predictors ---------------------------------------------------------------------------
+
+
+def test_baselines_are_averages_of_the_training_split(root, tmp_path):
+    metrics = baselines(CELL, root, tmp_path).metrics
+    truth = [scene(index)[0] for index in range(FRAMES)]
+    classes = np.stack([np.where(ids >= 26000, 26, ids) for ids in truth])
+    most = np.zeros((HEIGHT, WIDTH), int)
+    for label in (26, 23, 7, 1):  # ties go to the lowest class, which is the last to be written
+        best = np.stack([(classes == other).sum(0) for other in (26, 23, 7, 1)]).max(0)
+        most[(classes == label).sum(0) == best] = label
+    sky = 100 * (
+        ((classes == 23) & (most == 23)).sum()
+        / ((classes == 23) | ((most == 23) & (classes != 1))).sum()
+    )
+    assert metrics["semantic.class.sky.iou"] == pytest.approx(sky)
+    assert 0 < metrics["panoptic.pq"] < metrics["panoptic.class.road.pq"] < 100
+
+    depths = []
+    for index in range(FRAMES):
+        stored = scene(index)[1].astype(np.float32)
+        depth = BASELINE * FOCAL * 256 / np.maximum(stored - 1, 1e-9)
+        depths.append(np.where((stored > 1) & (depth < 80), depth, 0))
+    depths = np.stack(depths)
+    mean = depths.sum(0) / np.maximum((depths > 0).sum(0), 1)
+    rel = [np.mean(np.abs(mean - d)[d > 0] / d[d > 0]) for d in depths]
+    assert metrics["depth_dgc.abs_rel"] == pytest.approx(np.mean(rel), rel=1e-4)
+    assert 0 < metrics["depth_median.rmse"] < 20
+    assert metrics["dgc.failed"] == 0
+    # the same keys as a row's
+    assert set(metrics) >= {"panoptic.pq_things", "semantic.miou", "depth_median.delta3"}
+
+
+def test_baselines_are_computed_once_per_setting(root, tmp_path):
+    calls = []
+
+    def progress(*call):
+        calls.append(call)
+
+    first = baselines(CELL, root, tmp_path, progress=progress)
+    assert calls[-1] == (2 * FRAMES, 2 * FRAMES)
+    count = len(calls)
+    again = baselines(
+        replace(CELL, tasks=("depth",), seed=7, backbone="other"), root, tmp_path, progress=progress
+    )
+    assert len(calls) == count
+    assert (again.metrics, again.protocol) == (first.metrics, first.protocol)
+    nearer = replace(CELL.recipe, evaluate=replace(CELL.recipe.evaluate, max_depth_m=20.0))
+    other = baselines(replace(CELL, recipe=nearer), root, tmp_path)
+    assert other.metrics["depth_median.rmse"] < first.metrics["depth_median.rmse"]
+    assert len(list(tmp_path.glob("*.json"))) == len(list(tmp_path.iterdir())) == 2
+
+
+# --- export ---------------------------------------------------------------------------------------
+
+
+def test_the_official_evaluator_agrees_on_exported_predictions(root, tmp_path):
+    def blur(outputs):
+        outputs.semantic_BCHW = outputs.semantic_BCHW.roll((2, 3), (2, 3))
+        outputs.center_B1HW[1:, :, :, :64] = 0  # loses a car
+        return outputs
+
+    model = Oracle(CELL, change=blur)
+    expected = evaluate(model, CELL, root, CPU, batch_size=2).metrics
+    results = export_predictions(model, CELL, root, tmp_path / "out", CPU, batch_size=2)
+    convert2panoptic(str(root / "gtFine"), str(tmp_path), setNames=["val"])
+    truth = json.loads((tmp_path / "cityscapes_panoptic_val.json").read_text())
+    predictions = json.loads(results.read_text())["annotations"]
+    assert [item["image_id"] for item in predictions] == [
+        item["image_id"] for item in truth["annotations"]
+    ]
+    categories = {item["id"]: item for item in truth["categories"]}
+    statistics = csEval.pq_compute_single_core(
+        0,
+        list(zip(truth["annotations"], predictions, strict=True)),
+        str(tmp_path / "cityscapes_panoptic_val"),
+        str(results.with_suffix("")),
+        categories,
+    )
+    official = csEval.average_pq(statistics, categories)
+    assert 0 < official["All"]["pq"] < 1
+    assert expected["panoptic.pq"] / 100 == pytest.approx(official["All"]["pq"], abs=1e-9)
+    assert expected["panoptic.pq_things"] / 100 == pytest.approx(official["Things"]["pq"], abs=1e-9)
+
+
+def test_nothing_panoptic_nothing_to_export(root, tmp_path):
+    cell = replace(CELL, tasks=("depth",))
+    with pytest.raises(ValueError, match="no panoptic task"):
+        export_predictions(Oracle(cell), cell, root, tmp_path, CPU)

@@ -1,0 +1,154 @@
+import dataclasses
+from itertools import islice
+
+import pytest
+import torch
+from cityscapes_tree import HEIGHT, WIDTH, file, open_tree, write_tree
+
+from mtl_bench import config
+from mtl_bench.data.loader import eval_batches, open_dataset, train_batches
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return write_tree(tmp_path_factory.mktemp("data"), frames=7)
+
+
+def take(dataset, count, **settings):
+    return list(islice(train_batches(dataset, **{"batch_size": 3, "seed": 5, **settings}), count))
+
+
+def assert_same(one, two):
+    for field in dataclasses.fields(one):
+        a, b = getattr(one, field.name), getattr(two, field.name)
+        if isinstance(a, torch.Tensor):
+            assert a.dtype == b.dtype
+            assert torch.equal(a, b), field.name
+        else:
+            assert a == b
+
+
+def test_batches_are_stacked(tree):
+    (batch,) = take(open_tree(tree), 1)
+    assert len(batch.names) == 3
+    assert batch.image_B3HW.shape == (3, 3, HEIGHT, WIDTH)
+    assert batch.K_B33.shape == (3, 3, 3)
+    assert batch.camera_height_m_B.shape == (3,)
+    assert batch.context_BN3HW.shape == (3, 2, 3, HEIGHT, WIDTH)
+    assert batch.clean_context_BN3HW.shape == (3, 2, 3, HEIGHT, WIDTH)
+    assert batch.reprojection_mask_BHW.shape == (3, HEIGHT, WIDTH)
+    assert batch.reprojection_mask_BHW.dtype == torch.bool
+    assert batch.semantic_BHW.dtype == torch.int64
+    assert batch.center_B1HW.shape == (3, 1, HEIGHT, WIDTH)
+    assert batch.offset_B2HW.shape == (3, 2, HEIGHT, WIDTH)
+    assert batch.image_B3HW.is_contiguous()
+
+
+def test_any_step_can_be_the_first(tree):
+    dataset = open_tree(tree)
+    batches = take(dataset, 6)
+    for start in range(6):
+        (again,) = take(open_tree(tree), 1, start_step=start)
+        assert_same(batches[start], again)
+    for one, two in zip(batches[2:], take(dataset, 4, start_step=2), strict=True):
+        assert_same(one, two)
+
+
+def test_epochs_are_permutations_and_differ(tree):
+    names = [name for batch in take(open_tree(tree), 20) for name in batch.names]
+    epochs = [names[start : start + 6] for start in range(0, 60, 6)]  # the seventh is dropped
+    assert all(len(set(epoch)) == 6 for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) > 5
+    assert len(set(names)) == 7
+
+
+def test_seed_and_step_change_the_augmentation(tree):
+    dataset = open_tree(tree)
+    one, two = take(dataset, 1), take(dataset, 1, seed=6)
+    assert one[0].names != two[0].names or not torch.equal(one[0].image_B3HW, two[0].image_B3HW)
+    single = take(dataset, 30, batch_size=1)
+    same = [batch.image_B3HW for batch in single if batch.names == single[0].names]
+    assert len(same) > 1
+    assert not torch.equal(same[0], same[1])
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_give_the_same_batches(tree, workers):
+    settings = config.Augment(scales=(0.75, 1.0, 1.5), crop=(20, 30))
+    dataset = open_tree(tree, augment=settings)
+    here = take(dataset, 5, start_step=1)
+    there = take(dataset, 5, start_step=1, workers=workers)
+    for one, two in zip(here, there, strict=True):
+        assert_same(one, two)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_global_random_state_is_left_alone(tree, workers):
+    before = torch.get_rng_state()
+    take(open_tree(tree), 3, workers=workers)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_thread_count_changes_nothing(tmp_path):
+    size = (200, 400)  # large enough for torch to split its loops
+    write_tree(tmp_path, 2, size=size)
+    settings = config.Augment(scales=(0.75, 1.25), crop=(180, 420))
+    data = config.Data(height=size[0], width=size[1])
+    dataset = open_tree(tmp_path, augment=settings, data=data)
+    before = torch.get_num_threads()
+    try:
+        batches = []
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            batches.append(take(dataset, 4, batch_size=2))
+    finally:
+        torch.set_num_threads(before)
+    for one, two in zip(*batches, strict=True):
+        assert_same(one, two)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_broken_file_is_one_line_from_any_process(tmp_path, workers):
+    root = write_tree(tmp_path, 2)
+    path = file(root, "leftImg8bit", "aachen_000000_000019", "leftImg8bit.png")
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ValueError, match=f"^{path}: truncated PNG") as error:
+        take(open_tree(root), 1, batch_size=2, workers=workers)
+    assert "\n" not in str(error.value)
+
+
+def test_evaluation_goes_through_the_split_in_order(tree):
+    dataset = open_tree(tree, augment=None)
+    batches = list(eval_batches(dataset, 3))
+    assert [len(batch.names) for batch in batches] == [3, 3, 1]
+    assert [name for batch in batches for name in batch.names] == dataset.names
+    assert batches[2].instance_ids_BHW.shape == (1, HEIGHT, WIDTH)
+    assert batches[0].depth_m_BHW.shape == (3, HEIGHT, WIDTH)
+    for one, two in zip(batches, eval_batches(dataset, 3), strict=True):
+        assert_same(one, two)
+
+
+def cell(**changes):
+    data = config.Data(height=HEIGHT, width=WIDTH, dataset=changes.pop("dataset", "cityscapes"))
+    recipe = config.Recipe(data=data, loss=config.Loss(center_sigma=2.0))
+    return config.Cell(recipe, backbone="any", method="any", **changes)
+
+
+@pytest.mark.parametrize("dataset", ["cityscapes", "synthetic"])
+def test_a_cell_opens_what_its_tasks_need(tree, dataset):
+    both = open_dataset(cell(dataset=dataset), "train", tree, training=True)
+    (batch,) = take(both, 1)
+    assert batch.semantic_BHW is not None
+    assert batch.context_BN3HW is not None
+    (batch,) = take(open_dataset(cell(tasks=("panoptic",)), "train", tree, training=True), 1)
+    assert batch.context_BN3HW is None
+    (batch,) = take(open_dataset(cell(tasks=("depth",)), "train", tree, training=True), 1)
+    assert batch.semantic_BHW is None
+
+
+def test_errors(tree):
+    with pytest.raises(ValueError, match="did you mean 'cityscapes'"):
+        open_dataset(cell(dataset="cityscape"), "train", tree, training=True)
+    for batch_size in (0, 8):
+        with pytest.raises(ValueError, match="from 7 frames; set recipe"):
+            train_batches(open_tree(tree), batch_size, seed=0)

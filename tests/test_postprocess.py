@@ -1,0 +1,242 @@
+"""Grouping against a plain reference with loops, and the depth scale on planes of known height."""
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+
+from mtl_bench import config, postprocess
+from mtl_bench.data.labels import CITYSCAPES20, IGNORE
+from mtl_bench.data.targets import panoptic_targets
+from mtl_bench.metrics.panoptic import PanopticQuality
+from mtl_bench.model import Outputs
+
+THINGS = CITYSCAPES20.things
+ROAD, SKY, PERSON, CAR = (CITYSCAPES20.index(name) for name in ("road", "sky", "person", "car"))
+
+
+def settings(**changes) -> config.Evaluate:
+    return config.Evaluate(**{"stuff_area": 0, "nms_kernel": 3, **changes})
+
+
+def reference(class_HW, heat_HW, offset_2HW, things, ev):
+    """The rules, pixel by pixel."""
+    height, width = class_HW.shape
+    reach = ev.nms_kernel // 2
+    peaks = []
+    for y in range(height):
+        for x in range(width):
+            window = heat_HW[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+            if heat_HW[y, x] > np.float32(ev.center_threshold) and heat_HW[y, x] == window.max():
+                peaks.append((y, x))
+    peaks = [  # of a plateau, the first
+        (y, x)
+        for y, x in peaks
+        if not any(p < (y, x) and max(abs(p[0] - y), abs(p[1] - x)) <= reach for p in peaks)
+    ]
+    highest = sorted(peaks, key=lambda p: (-heat_HW[p], p))[: ev.top_k]
+    centers = sorted(highest)
+
+    result = np.empty((height, width), np.int64)
+    members = {}
+    for y in range(height):
+        for x in range(width):
+            result[y, x] = -1 if class_HW[y, x] == IGNORE else class_HW[y, x] * 1000
+            if class_HW[y, x] in things and centers:
+                at_y = np.float32(y) + offset_2HW[0, y, x]
+                at_x = np.float32(x) + offset_2HW[1, y, x]
+                distances = [(at_y - cy) ** 2 + (at_x - cx) ** 2 for cy, cx in centers]
+                members.setdefault(int(np.argmin(distances)), []).append((y, x))
+    for index, pixels in members.items():
+        votes = Counter(class_HW[pixel] for pixel in pixels)
+        winner = min(votes, key=lambda c: (-votes[c], c))
+        for pixel in pixels:
+            result[pixel] = winner * 1000 + index + 1
+    for label in range(len(CITYSCAPES20)):
+        area = (class_HW == label).sum()
+        if label not in things and area < ev.stuff_area:
+            result[class_HW == label] = -1
+    return result
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "ev",
+    [
+        settings(),
+        settings(center_threshold=0.8, nms_kernel=5, stuff_area=12),
+        settings(top_k=3),
+        settings(center_threshold=1.0),  # strict: no centers, although heat reaches 1
+    ],
+    ids=["plain", "filters", "top_k", "no_centers"],
+)
+def test_equals_the_rules_on_random_maps_full_of_ties(seed, ev, monkeypatch):
+    rng = np.random.default_rng(seed)
+    shape = (3, 15, 18)
+    classes = rng.choice([ROAD, SKY, PERSON, CAR, THINGS[-1], IGNORE], size=shape).astype(np.int64)
+    classes[2][np.isin(classes[2], THINGS)] = ROAD  # an image without things
+    heat = (rng.integers(0, 5, shape) / 4).astype(np.float32)  # plateaus, equal peaks
+    heat[0] *= seed % 2  # half of the time an image without centers beside others that have some
+    offset = rng.integers(-4, 5, (3, 2, 15, 18)).astype(np.float32) / 2  # equal distances
+    monkeypatch.setattr(postprocess, "CHUNK", 100)
+    result = postprocess.panoptic(
+        torch.from_numpy(classes),
+        torch.from_numpy(heat)[:, None],
+        torch.from_numpy(offset),
+        THINGS,
+        ev,
+    )
+    expected = [reference(*image, THINGS, ev) for image in zip(classes, heat, offset, strict=True)]
+    np.testing.assert_array_equal(result.numpy(), np.stack(expected))
+
+
+def test_logits_are_the_same_as_their_classes():
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(2, len(CITYSCAPES20), 9, 11, generator=generator)
+    heat = torch.rand(2, 1, 9, 11, generator=generator)
+    offset = torch.randn(2, 2, 9, 11, generator=generator)
+    results = [
+        postprocess.panoptic(semantic, heat, offset, THINGS, settings())
+        for semantic in (logits, logits.argmax(1))
+    ]
+    assert torch.equal(*results)
+
+
+def test_a_plateau_is_one_center():
+    heat = torch.zeros(1, 1, 12, 20)
+    heat[0, 0, 4:6, 3:15] = 1.0  # longer than the kernel
+    heat[0, 0, 10, 18] = 0.9
+    centers, count = postprocess.find_centers(heat, settings(nms_kernel=5))
+    assert count.tolist() == [2]
+    assert centers.tolist() == [[[4, 3], [10, 18]]]
+
+
+def test_an_even_kernel_is_refused():
+    with pytest.raises(ValueError, match="nms_kernel must be odd, not 4"):
+        postprocess.find_centers(torch.zeros(1, 1, 8, 8), settings(nms_kernel=4))
+
+
+def test_instance_ids_are_cityscapes_own():
+    panoptic = torch.tensor(
+        [[[-1, ROAD * 1000, 0, CAR * 1000 + 7, CAR * 1000, PERSON * 1000 + 200]]]
+    )
+    ids = postprocess.to_instance_ids(panoptic, CITYSCAPES20)
+    assert ids.dtype == torch.int32
+    assert ids.tolist() == [[[0, 7, 0, 26007, 26, 24200]]]
+
+
+def test_truth_to_targets_to_grouping_is_perfect():
+    ids = np.full((96, 160), 7, np.int32)
+    ids[:30] = 23
+    ids[90:] = 1  # ego vehicle
+    for number, (y, x, label) in enumerate(
+        [(20, 10, 24), (20, 40, 24), (50, 20, 26), (45, 90, 26), (60, 130, 33), (35, 135, 28)]
+    ):
+        ids[y : y + 14, x : x + 21] = label * 1000 + number
+    ids[70:80, 60:80] = 26  # a crowd: has no center, so grouping gives it to a neighbour
+    targets = panoptic_targets(ids, CITYSCAPES20, config.Loss(center_sigma=4))
+    panoptic = postprocess.panoptic(
+        torch.from_numpy(targets.semantic)[None],
+        torch.from_numpy(targets.center)[None, None],
+        torch.from_numpy(targets.offset)[None],
+        THINGS,
+        settings(nms_kernel=7),
+    )
+    quality = PanopticQuality(CITYSCAPES20)
+    predicted = postprocess.to_instance_ids(panoptic, CITYSCAPES20)[0].numpy()
+    predicted[ids == 26] = 0
+    quality.update(predicted, ids)
+    result = quality.compute()
+    assert result["pq"] == result["sq"] == result["rq"] == 100.0
+    assert set(result["per_class"]) == {"road", "sky", "person", "car", "bus", "bicycle"}
+
+
+def test_resize_scales_offsets_and_keeps_linear_inverse_depth():
+    rows = torch.linspace(0.1, 1.0, 8)[:, None].expand(8, 16)[None, None]
+    outputs = Outputs(
+        offset_B2HW=torch.full((1, 2, 8, 16), 3.0), center_B1HW=rows, inverse_depth=[rows]
+    )
+    larger = postprocess.resize(outputs, 16, 48)
+    assert larger.semantic_BCHW is None
+    assert torch.allclose(larger.offset_B2HW[0, 0], torch.tensor(6.0))
+    assert torch.allclose(larger.offset_B2HW[0, 1], torch.tensor(9.0))
+    column = larger.inverse_depth[0][0, 0, 1:-1, 0]
+    assert torch.allclose(column.diff(), torch.tensor(0.9 / 7 / 2), atol=1e-6)
+
+
+# --- depth scale ----------------------------------------------------------------------------------
+
+FOCAL, HEIGHT, WIDTH = 115.0, 64, 128
+
+
+def plane(camera_m=1.4, pitch=0.0, roll=0.0, height=HEIGHT, width=WIDTH):
+    """True depth of a road below a tilted camera, 60 m of sky elsewhere; K; where the road is."""
+    focal = FOCAL * width / WIDTH
+    K = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    ray_x, ray_y = (x - K[0, 2]) / focal, (y - K[1, 2]) / focal
+    normal = torch.tensor(
+        [math.sin(roll), math.cos(roll) * math.cos(pitch), math.cos(roll) * math.sin(pitch)]
+    )
+    rate = (normal[0] * ray_x + normal[1] * ray_y + normal[2]) / camera_m
+    road = rate > 1 / 60
+    return torch.where(road, 1 / rate.clamp(min=1e-6), 60.0)[None, None], K[None], road[None]
+
+
+@pytest.mark.parametrize(
+    ("pitch", "roll"), [(0.0, 0.0), (0.05, 0.0), (-0.03, 0.0), (0.0, 0.04), (0.04, -0.02)]
+)
+@pytest.mark.parametrize("size", [(64, 128), (400, 900)], ids=["small", "subsampled"])
+def test_scale_is_exact_on_a_plane(pitch, roll, size):
+    depth, K, road = plane(pitch=pitch, roll=roll, height=size[0], width=size[1])
+    scale, source = postprocess.dgc_scale(depth / 3.3, K, torch.tensor([1.4]), road)
+    assert source.tolist() == [postprocess.ROAD]
+    assert scale.item() == pytest.approx(3.3, rel=1e-4)
+
+
+def test_scale_without_a_road_comes_from_horizontal_surfaces():
+    depth, K, _ = plane(pitch=0.03)
+    depth[..., :, 90:] = 9.0  # a wall that faces the camera
+    for road in (None, torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)):
+        scale, source = postprocess.dgc_scale(depth / 0.7, K, torch.tensor([1.4]), road)
+        assert source.tolist() == [postprocess.NORMALS]
+        assert scale.item() == pytest.approx(0.7, rel=1e-4)
+
+
+def test_each_image_has_its_own_scale_and_a_wall_has_none():
+    depth, K, road = plane()
+    batch = torch.cat([depth / 2, torch.full_like(depth, 9.0), depth / 4])
+    masks = torch.cat([road, torch.zeros_like(road), road])
+    heights = torch.tensor([1.4, 1.4, 2.8])
+    scale, source = postprocess.dgc_scale(batch, K.expand(3, 3, 3), heights, masks)
+    assert source.tolist() == [postprocess.ROAD, postprocess.FAILED, postprocess.ROAD]
+    assert scale[[0, 2]].tolist() == pytest.approx([2.0, 8.0], rel=1e-4)
+    assert scale[1].isnan()
+
+
+def test_noise_and_wrong_road_pixels_move_the_scale_little():
+    """Means over 20 draws; normals of neighbouring pixels are off by 13 % and more at 5 % noise."""
+    depth, K, road = plane(pitch=0.02)
+    depth, K, road = (x.expand(20, *x.shape[1:]) for x in (depth, K, road))
+    generator = torch.Generator().manual_seed(0)
+    noisy = depth * (1 + 0.1 * torch.randn(depth.shape, generator=generator))
+    height = torch.full((20,), 1.4)
+    scale, _ = postprocess.dgc_scale(noisy, K, height, road)
+    assert scale.mean().item() == pytest.approx(1.0, abs=0.02)
+    assert scale.std().item() < 0.03
+
+    noisy[..., 40:56, 10:40] *= 0.6  # a car that was taken for road
+    scale, _ = postprocess.dgc_scale(noisy, K, height, road)
+    assert scale.mean().item() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_bend_of_the_depth_cannot_tilt_the_camera_far():
+    depth, K, road = plane()
+    bent = depth**0.5  # nothing like a plane
+    height = torch.tensor([1.4])
+    free, _ = postprocess.dgc_scale(bent, K, height, road)
+    level, _ = postprocess.dgc_scale(bent, K, height, road, max_tilt=0.0)
+    lowest_ray = postprocess.BELOW_HORIZON * (HEIGHT - 1) / 2 / FOCAL
+    assert level.item() / (1 + postprocess.MAX_TILT / lowest_ray) < free.item() < level.item()

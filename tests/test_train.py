@@ -1,0 +1,214 @@
+"""The loop: it learns, it stops on nonsense, and a killed run ends as if it had not been killed."""
+
+import csv
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from mtl_bench import checkpoint
+from mtl_bench.config import Optim, to_dict
+from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.engine import Engine, choose_device, seed_for
+from mtl_bench.progress import Interrupted, Progress
+from mtl_bench.results import write_json
+from mtl_bench.tracking import Tracker
+from mtl_bench.train import build, schedule, train
+
+CPU = torch.device("cpu")
+
+
+def run(cell, root: Path, run_dir: Path, progress=None):
+    run_dir.mkdir(exist_ok=True)
+    progress = progress or Progress(run_dir, lambda line: None)
+    return train(
+        cell, CITYSCAPES20, root, run_dir, Engine(CPU), progress, Tracker("off", cell, run_dir)
+    )
+
+
+def states(run_dir: Path) -> dict[str, torch.Tensor]:
+    """Every tensor of a checkpoint, by its path in it."""
+    flat: dict[str, torch.Tensor] = {}
+
+    def walk(value, where):
+        if isinstance(value, torch.Tensor):
+            flat[where] = value
+        elif isinstance(value, dict):
+            for key, inner in value.items():
+                walk(inner, f"{where}/{key}")
+
+    walk(checkpoint.read(run_dir / "last.pt"), "")
+    return flat
+
+
+def assert_same_state(one: Path, other: Path) -> None:
+    first, second = states(one), states(other)
+    assert first.keys() == second.keys()
+    assert len(first) > 100
+    different = [key for key in first if not torch.equal(first[key], second[key])]
+    assert different == []
+
+
+# Dies by SIGKILL, as a machine does, when step 5 is done and the last checkpoint is of step 3.
+KILLED = """
+import json, os, signal, sys
+from pathlib import Path
+import torch
+from mtl_bench.config import Cell, from_dict
+from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.engine import Engine
+from mtl_bench.progress import Progress
+from mtl_bench.tracking import Tracker
+from mtl_bench.train import train
+
+class Dies(Progress):
+    def update(self, stage, step, steps, note=""):
+        if step == 5:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+run_dir, root = Path(sys.argv[1]), Path(sys.argv[2])
+cell = from_dict(Cell, json.loads((run_dir / "cell.json").read_text()))
+train(cell, CITYSCAPES20, root, run_dir, Engine(torch.device("cpu")), Dies(run_dir, print),
+      Tracker("off", cell, run_dir))
+"""
+
+
+@pytest.mark.parametrize("method", ["fixed", "uncertainty", "fixed_uncertainty"])
+def test_killed_and_resumed_equals_straight_bit_for_bit(method, smoke_cell, smoke_root, tmp_path):
+    cell = replace(smoke_cell, method=method)
+    assert (cell.recipe.optim.steps, cell.recipe.optim.checkpoint_every) == (6, 3)
+    run(cell, smoke_root, tmp_path / "straight")
+
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    write_json(killed / "cell.json", to_dict(cell))
+    arguments = [sys.executable, "-c", KILLED, str(killed), str(smoke_root)]
+    done = subprocess.run(arguments, capture_output=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr.decode()[-2000:]
+    assert checkpoint.read(killed / "last.pt")["step"] == 3
+    run(cell, smoke_root, killed)
+
+    assert_same_state(tmp_path / "straight", killed)
+    for name in ("straight", "killed"):
+        with (tmp_path / name / "curve.csv").open() as file:
+            assert [int(row["step"]) for row in csv.DictReader(file)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_request_to_stop_saves_and_the_run_goes_on(smoke_cell, smoke_root, tmp_path):
+    class Asked(Progress):
+        def update(self, stage, step, steps, note=""):
+            self.stop_asked = step == 2
+
+    run(smoke_cell, smoke_root, tmp_path / "straight")
+    stopped = tmp_path / "stopped"
+    stopped.mkdir()
+    with pytest.raises(Interrupted, match="stopped at step 2 of 6"):
+        run(smoke_cell, smoke_root, stopped, Asked(stopped, print))
+    run(smoke_cell, smoke_root, stopped)
+    assert_same_state(tmp_path / "straight", stopped)
+
+
+def test_seeds_differ_and_a_seed_repeats(smoke_cell, smoke_root, tmp_path):
+    run(smoke_cell, smoke_root, tmp_path / "one")
+    run(smoke_cell, smoke_root, tmp_path / "again")
+    run(replace(smoke_cell, seed=1), smoke_root, tmp_path / "other")
+    assert_same_state(tmp_path / "one", tmp_path / "again")
+    key = "/model/net.heads.semantic.1.weight"
+    assert not torch.equal(states(tmp_path / "one")[key], states(tmp_path / "other")[key])
+
+
+def test_losses_fall(smoke_cell, smoke_root, tmp_path, with_optim):
+    cell = with_optim(replace(smoke_cell, method="fixed"), steps=60, checkpoint_every=60)
+    run(cell, smoke_root, tmp_path / "run")
+    with (tmp_path / "run" / "curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+
+    def mean(column, part):
+        return sum(float(row[column]) for row in part) / len(part)
+
+    for column in ("loss.semantic", "loss.center", "loss.photometric", "total"):
+        assert mean(column, rows[-10:]) < 0.9 * mean(column, rows[:10]), column
+
+
+@pytest.mark.parametrize(
+    ("tasks", "terms"),
+    [
+        (("panoptic",), {"semantic", "center", "offset"}),
+        (("depth",), {"photometric", "smoothness"}),
+    ],
+)
+def test_single_tasks_train_their_terms_only(tasks, terms, smoke_cell, smoke_root, tmp_path):
+    run(replace(smoke_cell, tasks=tasks), smoke_root, tmp_path / "run")
+    with (tmp_path / "run" / "curve.csv").open() as file:
+        columns = next(csv.DictReader(file))
+    assert {name.removeprefix("loss.") for name in columns if name.startswith("loss.")} == terms
+
+
+def test_nan_stops_with_the_terms_name(smoke_cell, smoke_root, tmp_path, with_optim):
+    cell = with_optim(smoke_cell, lr=1e30, clip=None, warmup_steps=0)
+    with pytest.raises(FloatingPointError, match=r"loss term '\w+' is (nan|-?inf) at step \d"):
+        run(cell, smoke_root, tmp_path / "run")
+    assert not (tmp_path / "run" / "row.json").exists()
+
+
+def test_learning_rates_of_the_three_groups(smoke_cell, with_optim):
+    cell = with_optim(smoke_cell, lr=1e-4, head_lr_factor=10.0, method_lr=3e-4, weight_decay=0.1)
+    model, method, optimizer = build(cell, CITYSCAPES20, Engine(CPU))
+    by_parameter = {id(p): group for group in optimizer.param_groups for p in group["params"]}
+    heads = {id(p) for p in model.head_parameters()}
+    for parameter in model.parameters():
+        expected = 1e-3 if id(parameter) in heads else 1e-4
+        assert by_parameter[id(parameter)]["lr"] == pytest.approx(expected)
+    for parameter in method.parameters():
+        group = by_parameter[id(parameter)]
+        assert (group["lr"], group["weight_decay"]) == (3e-4, 0.0)
+
+
+def test_schedule_is_the_papers():
+    expected = {0: 0.1, 1: 0.1008985, 500: 0.5458733, 999: 0.9841159, 1000: 0.9849874}
+    expected |= {30000: 0.5358867, 59999: 5.008e-5}
+    for step, factor in expected.items():
+        assert schedule(step, Optim()) == pytest.approx(factor, rel=1e-4)
+
+
+def test_engine_refuses_what_it_cannot_do():
+    with pytest.raises(ValueError, match="fp16 trains on CUDA only"):
+        Engine(CPU, "fp16")
+    with pytest.raises(ValueError, match="no precision 'fp8'"):
+        Engine(CPU, "fp8")
+    with pytest.raises(ValueError, match="no device 'tpu'"):
+        choose_device("tpu")
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="use --device cpu"):
+            choose_device("cuda")
+
+
+def test_seeds_of_purposes_are_independent():
+    purposes = ("data", "method", "initial weights")
+    assert len({seed_for(seed, purpose) for seed in range(3) for purpose in purposes}) == 9
+
+
+def test_damaged_checkpoint_is_named(tmp_path):
+    path = tmp_path / "last.pt"
+    with pytest.raises(ValueError, match=r"no checkpoint .*last\.pt"):
+        checkpoint.read(path)
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(ValueError, match=r"last\.pt is not a readable checkpoint"):
+        checkpoint.read(path)
+    torch.save({"weights": torch.ones(1)}, path)
+    with pytest.raises(ValueError, match="is not a checkpoint of format"):
+        checkpoint.read(path)
+
+
+def test_bfloat16_trains(smoke_cell, smoke_root, tmp_path):
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    engine = Engine(CPU, "bf16")
+    progress = Progress(run_dir, print)
+    tracker = Tracker("off", smoke_cell, run_dir)
+    train(smoke_cell, CITYSCAPES20, smoke_root, run_dir, engine, progress, tracker)
+    assert all(t.isfinite().all() for t in states(run_dir).values() if t.is_floating_point())
