@@ -4,8 +4,8 @@ Shapes: B samples, H x W pixels. Pixel centres are integers, the top-left one is
 axes: x right, y down, z forward; intrinsics K without skew. Metres, or any other unit that depth
 and translation share. Everything works in the precision of what it is given, on its device.
 
-kornia's warp (`warp_frame_depth`) gives the same image, but no mask, in two to three times the time;
-its normals come from Sobel filters. The tests compare with both of its projections.
+kornia's `warp_frame_depth` gives the same image in two to three times the time, but no mask; its
+normals come from Sobel filters. It serves the tests as the oracle.
 """
 
 import torch

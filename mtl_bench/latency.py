@@ -62,9 +62,9 @@ def measure(
         Values under `latency.`: mean_ms, std_ms, p50_ms, p95_ms, p99_ms, fps (1000 / mean), the
         means of the three stages (they add up to mean_ms), drift (last quarter of the passes
         against the first, 0.1 = 10 % slower), params_m (parameters that a pass uses, millions),
-        gmacs (multiply-adds of the network, 1e9), peak_mib and peak_kind (see `_peak`), and what
-        was measured: passes, warmup, images (distinct), height, width, device, precision, threads,
-        clock.
+        gmacs (multiply-adds of the network's convolutions and matrix products, 1e9), peak_mib and
+        peak_kind (see `_peak`), and what was measured: passes, warmup, images (distinct), height,
+        width, device, precision, threads, clock.
 
     Raises:
         ValueError: no images or no passes.

@@ -157,7 +157,7 @@ class Launcher:
         if (code or not (job.directory / "row.json").is_file()) and not failure.is_file():
             log = (job.directory / "log.txt").read_text(errors="replace")
             results.write_failure(job.directory, explain_exit(code, log), log, code)
-        return results.inspect(job.cell, self.runs)
+        return results.stored(job.cell, self.runs)
 
     def _end(self, job: Job, state: results.State, how: str = "") -> None:
         self._states[job.cell.id] = state

@@ -18,6 +18,7 @@ from mtl_bench.model.network import Outputs
 DIVISOR = 1000
 VOID = -1
 CHUNK = 2**22  # distances held at once: 16 MiB
+CPU_CHUNK = 2**17  # what a core's cache holds
 
 DGC_SOURCES = ("road", "normals", "failed")  # meaning of dgc_scale's codes
 ROAD, NORMALS, FAILED = range(3)
@@ -103,18 +104,13 @@ def find_centers(center_B1HW: Tensor, ev: config.Evaluate) -> tuple[Tensor, Tens
     """Local maxima above the threshold: (y, x) [B,K,2], filled up with inf; counts [B].
 
     In reading order. Where there are more than `ev.top_k`, the highest stay; of equals, the first.
-    A plateau, such as a saturated or an enlarged heat map has, is one center, its first pixel:
-    MGNet's public code makes every pixel of it a center and so cuts the instance into pieces.
+    Equal neighbours are both centers: of two true instances closer than the kernel neither is lost.
     """
     kernel = ev.nms_kernel
     if kernel % 2 == 0:
         raise ValueError(f"evaluate.nms_kernel must be odd, not {kernel}")
     heat_B1HW = center_B1HW.float()
     is_peak_B1HW = (heat_B1HW == _highest(heat_B1HW, kernel)) & (heat_B1HW > ev.center_threshold)
-    size = heat_B1HW[0].numel()
-    earliness_HW = torch.arange(size, 0, -1, device=heat_B1HW.device).view(heat_B1HW.shape[2:])
-    earliness_B1HW = torch.where(is_peak_B1HW, earliness_HW.double(), 0)  # float32 ends at 2^24
-    is_peak_B1HW &= earliness_B1HW == _highest(earliness_B1HW, kernel)
     image_P, _, y_P, x_P = is_peak_B1HW.nonzero(as_tuple=True)
 
     images = heat_B1HW.shape[0]
@@ -156,13 +152,16 @@ def _highest(x_B1HW: Tensor, kernel: int) -> Tensor:
 
 
 def _nearest(target_N2: Tensor, image_N: Tensor, centers_BK2: Tensor) -> Tensor:
-    """Index [N] of the nearest center of the pixel's image, a few million distances at a time."""
-    size = max(CHUNK // max(centers_BK2.shape[1], 1), 1)
+    """Index [N] of the nearest center of the pixel's image; pixels come image by image."""
+    chunk = CPU_CHUNK if target_N2.device.type == "cpu" else CHUNK
+    size = max(chunk // centers_BK2.shape[1], 1)
+    pixels = torch.bincount(image_N, minlength=len(centers_BK2)).tolist()
     parts = []
-    for target_n2, image_n in zip(target_N2.split(size), image_N.split(size), strict=True):
-        delta_y_nK = target_n2[:, :1] - centers_BK2[image_n, :, 0]
-        delta_x_nK = target_n2[:, 1:] - centers_BK2[image_n, :, 1]
-        parts.append((delta_y_nK * delta_y_nK + delta_x_nK * delta_x_nK).argmin(1))
+    for target_P2, center_K2 in zip(target_N2.split(pixels), centers_BK2, strict=True):
+        for target_p2 in target_P2.split(size):
+            distance_pK = (target_p2[:, :1] - center_K2[:, 0]).square_()
+            distance_pK += (target_p2[:, 1:] - center_K2[:, 1]).square_()
+            parts.append(distance_pK.argmin(1))
     return torch.cat(parts)
 
 
@@ -194,6 +193,7 @@ def dgc_scale(
     camera_height_m_B: Tensor,
     road_BHW: Tensor | None,
     max_tilt: float = MAX_TILT,
+    pitch_rad_B: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Factor [B] from depth to metres, and where it came from [B] (an index into DGC_SOURCES).
 
@@ -214,7 +214,8 @@ def dgc_scale(
         K_B33: intrinsics in pixels of that map.
         camera_height_m_B: above the road.
         road_BHW: bool, predicted; None without a panoptic task.
-        max_tilt: tangent of the largest pitch and roll; 0 = always a level camera.
+        max_tilt: tangent of the largest pitch and roll to look for; 0 = none.
+        pitch_rad_B: the calibrated pitch to start from, positive looks down; None = level.
     """
     step = math.ceil(math.sqrt(depth_B1HW.shape[2] * depth_B1HW.shape[3] / GRID))
     depth_BHW = depth_B1HW[:, 0, ::step, ::step].double()
@@ -231,7 +232,12 @@ def dgc_scale(
         has_road_B = road_BHW.sum((1, 2)) >= max(least, 3)
         ground_BHW = torch.where(has_road_B[:, None, None], road_BHW, flat_BHW)
 
-    height_B = _height(depth_BHW, ray_x_BHW, ray_y_BHW, ground_BHW, max_tilt)
+    pitch_B11 = torch.zeros_like(depth_BHW[:, :1, :1])
+    if pitch_rad_B is not None:
+        pitch_B11 = pitch_rad_B.to(depth_BHW)[:, None, None]
+    down_BHW = ray_y_BHW * pitch_B11.cos() + pitch_B11.sin()
+    ground_BHW = ground_BHW & (down_BHW > 0)
+    height_B = _height(depth_BHW, ray_x_BHW, down_BHW, ground_BHW, max_tilt, pitch_B11[:, :, 0])
     source_B = torch.where(has_road_B, ROAD, torch.where(has_flat_B, NORMALS, FAILED))
     source_B = torch.where((height_B > 0) & height_B.isfinite(), source_B, FAILED)
     scale_B = camera_height_m_B.double() / height_B
@@ -249,19 +255,25 @@ def _rays(depth_BHW: Tensor, K_B33: Tensor, step: int) -> tuple[Tensor, Tensor]:
 
 
 def _height(
-    depth_BHW: Tensor, ray_x_BHW: Tensor, ray_y_BHW: Tensor, ground_BHW: Tensor, max_tilt: float
+    depth_BHW: Tensor,
+    ray_x_BHW: Tensor,
+    down_BHW: Tensor,
+    ground_BHW: Tensor,
+    max_tilt: float,
+    pitch_B1: Tensor,
 ) -> Tensor:
     """Median height [B] of the camera above the ground pixels; NaN without any.
 
-    With n = (p, 1, q) / |.| a plane has 1 / (depth * ray_y) = c (1 + p ray_x / ray_y + q / ray_y):
-    a regression whose noise is alike everywhere. Least absolute deviations, by reweighting.
+    `down` is the ray's part along g, straight down for a camera of the calibrated pitch. With
+    n = (g + p x + q z) / |.| a plane has 1 / (depth * down) = c (1 + p ray_x / down + q / down): a
+    regression whose noise is alike everywhere. Least absolute deviations, by reweighting.
     """
-    image_B = depth_BHW.flatten(1).shape
-    ground_BP = ground_BHW.reshape(image_B)
-    x_BP = torch.where(ground_BP, ray_x_BHW.reshape(image_B), 0)
-    y_BP = torch.where(ground_BP, ray_y_BHW.reshape(image_B), 1)
-    depth_BP = torch.where(ground_BP, depth_BHW.reshape(image_B), torch.nan)
-    level_BP = depth_BP * y_BP  # the height, were the camera level
+    flat = depth_BHW.flatten(1).shape
+    ground_BP = ground_BHW.reshape(flat)
+    x_BP = torch.where(ground_BP, ray_x_BHW.reshape(flat), 0)
+    y_BP = torch.where(ground_BP, down_BHW.reshape(flat), 1)
+    depth_BP = torch.where(ground_BP, depth_BHW.reshape(flat), torch.nan)
+    level_BP = depth_BP * y_BP  # the height, were there no tilt
     median_B1 = level_BP.nanmedian(1, keepdim=True).values
     inverse_BP = torch.nan_to_num(median_B1 / level_BP)  # about 1, which scales the regression
     basis_B3P = torch.stack([torch.ones_like(y_BP), x_BP / y_BP, 1 / y_BP], 1) * ground_BP[:, None]
@@ -278,10 +290,11 @@ def _height(
         weight_BP = ground_BP / residual_BP.clamp(min=1e-4)
 
     slope_B, tilt_x_B, tilt_z_B = solution_B31.squeeze(2).unbind(1)
-    sound_B = slope_B > 0.1  # of about 1; otherwise there is no ground in this depth: stay level
+    sound_B = slope_B > 0.1  # of about 1; otherwise there is no ground in this depth: no tilt
     p_B1 = torch.where(sound_B, tilt_x_B / slope_B, 0).clamp(-max_tilt, max_tilt)[:, None]
     q_B1 = torch.where(sound_B, tilt_z_B / slope_B, 0).clamp(-max_tilt, max_tilt)[:, None]
-    height_BP = depth_BP * (p_B1 * x_BP + y_BP + q_B1) / (1 + p_B1**2 + q_B1**2).sqrt()
+    length_B1 = (1 + p_B1**2 + q_B1**2 + 2 * q_B1 * pitch_B1.sin()).sqrt()
+    height_BP = depth_BP * (p_B1 * x_BP + y_BP + q_B1) / length_B1
     return height_BP.nanmedian(1).values
 
 

@@ -14,6 +14,7 @@ runs/<method>-<backbone>-s<seed>-<id>/
 import json
 import os
 import shutil
+import threading
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +42,7 @@ def run_dir(cell: Cell, runs: Path) -> Path:
 
 def write_json(path: Path, value: Any) -> None:
     """Atomic: a reader sees the old file or the new one, whole."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
     with temporary.open("w", encoding="utf-8") as file:
         json.dump(value, file, indent=1)
         file.write("\n")
@@ -94,10 +95,15 @@ def status(cell: Cell, runs: Path) -> Word:
 
 def inspect(cell: Cell, runs: Path) -> State:
     """A cell's status, why it is that, and its row where there is one."""
+    if claimed_by(run_dir(cell, runs)) is not None:
+        return State("running")
+    return stored(cell, runs)
+
+
+def stored(cell: Cell, runs: Path) -> State:
+    """The status that the files give, whoever runs the cell at the moment."""
     directory = run_dir(cell, runs)
     row = load_row(directory)
-    if claimed_by(directory) is not None:
-        return State("running", row=row)
     if row is not None:
         why = changed(row.get("code", {}), cell)
         return State("stale" if why else "done", why, row)

@@ -63,8 +63,14 @@ def test_warp_by_nothing_changes_nothing(K_133: Tensor) -> None:
     warped, valid = geometry.warp(image, depth, still, K_133)
     assert (warped - image).abs().max().item() < 3e-15
     assert valid.all()
-    _, valid = geometry.warp(image.float(), depth.float(), still.float(), K_133.float())
-    assert valid.all()  # rounding at the border is not out of view
+
+
+def test_rounding_at_the_border_is_not_out_of_view() -> None:
+    torch.manual_seed(0)
+    K = torch.tensor([[[101.7, 0, 63.3], [0, 98.9, 30.1], [0, 0, 1]]])
+    depth, still = 1 + 50 * torch.rand(1, 1, 64, 128), torch.eye(4)[None]
+    _, valid = geometry.warp(torch.rand(1, 3, 64, 128), depth, still, K)
+    assert valid.all()
 
 
 def test_warp_is_projection_of_moved_points(K_133: Tensor, pose_144: Tensor) -> None:
@@ -109,6 +115,7 @@ def test_out_of_view_and_behind_the_camera(K_133: Tensor) -> None:
     assert (warped[..., 11:].abs() < 1e-12).all()
 
     move[0, :3, 3] = torch.tensor([0, 0, -3.0])  # the points come to lie behind the camera
+    K_133[0, :2, 2] = torch.tensor([8, 6])  # one of them right behind it
     depth.requires_grad_()
     warped, valid = geometry.warp(image, depth, move, K_133)
     assert not valid.any()
@@ -120,7 +127,7 @@ def test_out_of_view_and_behind_the_camera(K_133: Tensor) -> None:
 def test_extreme_depths_stay_finite(K_133: Tensor, pose_144: Tensor) -> None:
     inverse = torch.tensor([0.0, 1e-30, 1e-6, 2.0]).repeat(1, 1, 12, 4).requires_grad_()
     depth = geometry.depth_from_inverse(inverse)
-    assert depth.max() == pytest.approx(1e6)
+    assert depth.max().item() == pytest.approx(1e6)
     image = torch.rand(1, 3, 12, 16)
     warped, _ = geometry.warp(image, depth, pose_144.float(), K_133.float())
     warped.sum().backward()

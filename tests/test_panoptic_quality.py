@@ -118,6 +118,16 @@ def test_truth_is_perfect_and_ego_vehicle_is_void():
     assert np.isnan(ours([ids], [ids])["pq_things"])
 
 
+def test_a_prediction_half_on_void_is_wrong_and_more_than_half_is_forgiven():
+    true = np.full((10, 10), 7, np.int32)
+    true[:, 5:] = 0
+    for columns, fp in ((slice(4, 6), 1), (slice(4, 7), 0)):
+        predicted = np.where(true == 7, 7, 0)
+        predicted[:, columns] = 26001
+        result = ours([true], [predicted])
+        assert result["per_class"].get("car", {"fp": 0})["fp"] == fp
+
+
 # --- published values -----------------------------------------------------------------------------
 
 CLASS_OF_COLOR = {(0, 0, 0): 0, (0, 0, 255): 1, (255, 0, 0): 2, (0, 255, 0): 3}

@@ -31,11 +31,6 @@ def reference(class_HW, heat_HW, offset_2HW, things, ev):
             window = heat_HW[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
             if heat_HW[y, x] > np.float32(ev.center_threshold) and heat_HW[y, x] == window.max():
                 peaks.append((y, x))
-    peaks = [  # of a plateau, the first
-        (y, x)
-        for y, x in peaks
-        if not any(p < (y, x) and max(abs(p[0] - y), abs(p[1] - x)) <= reach for p in peaks)
-    ]
     highest = sorted(peaks, key=lambda p: (-heat_HW[p], p))[: ev.top_k]
     centers = sorted(highest)
 
@@ -80,7 +75,7 @@ def test_equals_the_rules_on_random_maps_full_of_ties(seed, ev, monkeypatch):
     heat = (rng.integers(0, 5, shape) / 4).astype(np.float32)  # plateaus, equal peaks
     heat[0] *= seed % 2  # half of the time an image without centers beside others that have some
     offset = rng.integers(-4, 5, (3, 2, 15, 18)).astype(np.float32) / 2  # equal distances
-    monkeypatch.setattr(postprocess, "CHUNK", 100)
+    monkeypatch.setattr(postprocess, "CPU_CHUNK", 100)
     result = postprocess.panoptic(
         torch.from_numpy(classes),
         torch.from_numpy(heat)[:, None],
@@ -104,13 +99,25 @@ def test_logits_are_the_same_as_their_classes():
     assert torch.equal(*results)
 
 
-def test_a_plateau_is_one_center():
+def test_the_least_areas_are_kept():
+    classes = torch.full((1, 6, 6), ROAD)
+    classes[0, 0, :4] = SKY
+    nothing = torch.zeros(1, 2, 6, 6)
+    for least, expected in ((4, SKY * 1000), (5, -1)):
+        ev = settings(stuff_area=least)
+        result = postprocess.panoptic(classes, nothing[:, :1], nothing, THINGS, ev)
+        assert result[0, 0, 0] == expected
+        assert result[0, 5, 5] == ROAD * 1000
+
+
+def test_equal_neighbours_are_both_centers():
     heat = torch.zeros(1, 1, 12, 20)
-    heat[0, 0, 4:6, 3:15] = 1.0  # longer than the kernel
+    heat[0, 0, 4, 3:5] = 1.0
+    heat[0, 0, 5, 6] = 0.9  # lower, and in their window
     heat[0, 0, 10, 18] = 0.9
     centers, count = postprocess.find_centers(heat, settings(nms_kernel=5))
-    assert count.tolist() == [2]
-    assert centers.tolist() == [[[4, 3], [10, 18]]]
+    assert count.tolist() == [3]
+    assert centers.tolist() == [[[4, 3], [4, 4], [10, 18]]]
 
 
 def test_an_even_kernel_is_refused():
@@ -194,6 +201,26 @@ def test_scale_is_exact_on_a_plane(pitch, roll, size):
     scale, source = postprocess.dgc_scale(depth / 3.3, K, torch.tensor([1.4]), road)
     assert source.tolist() == [postprocess.ROAD]
     assert scale.item() == pytest.approx(3.3, rel=1e-4)
+
+
+def test_a_known_pitch_needs_no_search():
+    depth, K, road = plane(pitch=0.08)  # more than is searched for
+    pitch = torch.tensor([0.08])
+    for max_tilt in (0.0, postprocess.MAX_TILT):
+        scale, _ = postprocess.dgc_scale(
+            depth / 2, K, torch.tensor([1.4]), road, max_tilt=max_tilt, pitch_rad_B=pitch
+        )
+        assert scale.item() == pytest.approx(2.0, rel=1e-4)
+    unknown, _ = postprocess.dgc_scale(depth / 2, K, torch.tensor([1.4]), road, max_tilt=0.0)
+    assert unknown.item() > 2.4
+
+
+def test_a_pitch_that_is_off_is_corrected():
+    depth, K, road = plane(pitch=0.05, roll=0.02)
+    scale, _ = postprocess.dgc_scale(
+        depth, K, torch.tensor([1.4]), road, pitch_rad_B=torch.tensor([0.03])
+    )
+    assert scale.item() == pytest.approx(1.0, rel=1e-4)
 
 
 def test_scale_without_a_road_comes_from_horizontal_surfaces():

@@ -75,10 +75,7 @@ def run(
 
     plugins.check_cells([cell])
     directory = results.run_dir(cell, runs)
-    state = results.inspect(cell, runs)
-    if state.row is not None and not rerun:
-        stale = f", but stale: {state.why}" if state.word == "stale" else ""
-        typer.echo(f"done already{stale} (--rerun runs it again): {directory}/row.json")
+    if not rerun and _done_already(cell, runs):
         return
     root = o.data_root(cell, data, quiet)
 
@@ -90,6 +87,8 @@ def run(
         with claim.claim(directory):
             if rerun:
                 results.clear(directory)
+            elif _done_already(cell, runs):  # by another process, in the meantime
+                return
             _, dropped = results.begin(cell, runs)
             if dropped:
                 echo(f"starting over, as what the checkpoint was made with is no more: {dropped}")
@@ -98,6 +97,18 @@ def run(
         typer.echo(f"mtl-bench: {error}", err=True)
         raise typer.Exit(launch.CLAIMED) from None
     echo(f"{directory}/row.json")
+
+
+def _done_already(cell: Cell, runs: Path) -> bool:
+    from mtl_bench import results
+
+    state = results.stored(cell, runs)
+    if state.row is None:
+        return False
+    stale = f", but stale: {state.why}" if state.word == "stale" else ""
+    row = results.run_dir(cell, runs) / "row.json"
+    typer.echo(f"done already{stale} (--rerun runs it again): {row}")
+    return True
 
 
 def _run_recorded(

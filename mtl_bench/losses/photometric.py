@@ -1,7 +1,7 @@
 """Photometric loss: how well the neighbouring frames, warped by depth and pose, rebuild a frame.
 
-Shapes: S scales, B samples, N context frames, M images compared with one target, H x W pixels.
-Images are RGB in [0, 1], without colour jitter.
+Shapes: S scales, B samples, N context frames, H x W pixels. Images are RGB in [0, 1], without
+colour jitter.
 """
 
 from collections.abc import Sequence

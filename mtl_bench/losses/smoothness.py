@@ -15,9 +15,9 @@ def smoothness_loss(
     """Gradients of the mean-normalised inverse depth, forgiven where the image has edges.
 
     Godard et al., "Unsupervised monocular depth estimation with left-right consistency" (CVPR
-    2017), normalised as in Wang et al. (CVPR 2018). Scale i counts 2^-i. The mean over scales, where
-    the paper writes a sum (its public code: the mean). A difference belongs to its left or top
-    pixel, and counts where the mask has that pixel.
+    2017), normalised as in Wang et al. (CVPR 2018). Scale i counts 2^-i. The mean over scales,
+    where the paper writes a sum (its public code: the mean). A difference belongs to its left or
+    top pixel, and counts where the mask has that pixel.
 
     Args:
         inverse_SB1HW: one inverse depth a scale, all at full resolution.

@@ -67,7 +67,7 @@ def single(row: Row, name: str) -> str:
 
 
 def title(column: Column, arrows: dict[int, str] = ARROWS) -> str:
-    return f"{column.title} {arrows[column.better]}"
+    return f"{column.title}\u00a0{arrows[column.better]}"  # kept on one line
 
 
 def axis_title(axis: str) -> str:

@@ -17,7 +17,7 @@ def _footnotes(table: Table) -> Iterator[str]:
             "Mean +- sample standard deviation over n seeds. Bold: ahead of every other plain line "
             "by more than either's spread, and of the trivial predictor by more than its own."
         )
-    if any(len(group.rows) == 1 for group in groups):
+    if any(len(group.rows) == 1 for group in [g for g in groups if not g.mark] or groups):
         yield (
             "n = 1: one seed has no spread, so a lead by it or over it cannot be told from chance, "
             "and nothing is bold."
@@ -27,10 +27,13 @@ def _footnotes(table: Table) -> Iterator[str]:
     if table.baseline:
         yield (
             "Trivial predictor: the training split's mean depth image and most frequent class per "
-            "pixel. It looks at no image; a network has to beat it. Its depth is in metres already: "
-            "nothing scales it under dgc."
+            "pixel. It looks at no image; a network has to beat it. Its depth is in metres "
+            "already, so nothing scales it under dgc."
         )
-    if any(group.status == "stale" for group in groups):
-        yield "Stale: the code changed after these cells ran; run again with --rerun stale."
+    stale = [row for group in groups if group.status == "stale" for row in group.rows]
+    if stale:
+        why = ", ".join(dict.fromkeys(str(row["error"]) for row in stale if row.get("error")))
+        because = f" ({why})" if why else ""
+        yield f"Stale: code changed after these cells ran{because}; run again with --rerun stale."
     if any(group.smoke for group in groups):
         yield "Smoke: a few training steps that show that the pipeline works. Not a result."

@@ -87,7 +87,8 @@ def curves(table: Table, runs: Curves, prefix: str, out_dir: Path) -> str | None
             for group, look in _looks(table):
                 several = [f for f in runs.get(group.label, ()) if term in f]
                 if several:
-                    handles.setdefault(group.label, _curve(axes, several, term, look))
+                    line = _curve(axes, several, term, look, group.status == "stale")
+                    handles.setdefault(group.label, line)
             axes.set_title(term.removeprefix(f"{prefix}."))
             axes.set_xlabel("step")
             _log_scale(axes)
@@ -176,13 +177,17 @@ def _where_timed(groups: Sequence[Group]) -> str:
     return ", ".join(["batch 1", *sizes]) + "\n" + ", ".join([*devices, *counts])
 
 
-def _curve(axes: Axes, frames: Sequence[pd.DataFrame], column: str, look: Look) -> object:
+def _curve(
+    axes: Axes, frames: Sequence[pd.DataFrame], column: str, look: Look, faint: bool
+) -> object:
+    """Mean over seeds with their range; faint for stale numbers."""
     last = max(int(frame["step"].max()) for frame in frames)
     width = max(1, math.ceil(last / POINTS))
     binned = [f.groupby((f["step"] - 1) // width)[["step", column]].mean() for f in frames]
     joined = pd.concat(binned).groupby(level=0)
     step, middle = joined["step"].mean(), joined[column]
-    (line,) = axes.plot(step, middle.mean(), color=look.color, linestyle=look.dash, linewidth=1.4)
+    style = {"color": look.color, "linestyle": look.dash, "alpha": 0.5 if faint else 1.0}
+    (line,) = axes.plot(step, middle.mean(), linewidth=0.8 if faint else 1.4, **style)
     if len(frames) > 1:
         axes.fill_between(
             step, middle.min(), middle.max(), color=look.color, alpha=0.18, linewidth=0

@@ -94,7 +94,9 @@ class Group:
 
     @property
     def label(self) -> str:
-        return ", ".join(filter(None, self.names))
+        """One short text for a legend."""
+        short = " (stale)" * (self.status == "stale") + " (smoke)" * self.smoke
+        return ", ".join(filter(None, self.identity)) + short
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from mtl_bench.data.synthetic.camera import FloatArray
 from mtl_bench.data.synthetic.noise import fractal_noise, lattice_noise
 from mtl_bench.data.synthetic.primitives import Solids, unit_normals
-from mtl_bench.data.synthetic.texture import OCTAVES, PATCHES, Markings, Material, Patch
+from mtl_bench.data.synthetic.texture import ALONG, OCTAVES, PATCHES, Markings, Material, Patch
+
+_FILTER_PX = np.float32(3.0)  # width of the patterns' box filter
 
 
 @dataclass(frozen=True)
@@ -88,18 +90,23 @@ def surface(
     normal = (turn * local[:, None, :]).sum(2)
     normal /= np.sqrt((normal * normal).sum(1, keepdims=True))
     length = np.sqrt((ray_N3 * ray_N3).sum(1))
-    facing = np.clip(-(normal * ray_N3).sum(1) / length, 0.12, 1)
-    footprint = depth_N * np.float32(pixel_rad) / np.sqrt(facing)
+    facing = np.clip(-(normal * ray_N3).sum(1) / length, 0.02, 1)
+    footprint = depth_N * np.float32(pixel_rad)
+    stretched = footprint / facing
     p = unit_N3 * half
     material = solids.material_P[index_N]
     shift = (index_N.astype(np.float32) * np.float32(1.37))[:, None]
     fixed = np.isin(material, (Material.ASPHALT, Material.PAVING, Material.GRASS))[:, None]
-    noise = fractal_noise(np.where(fixed, world_N3, p + shift), OCTAVES[material], footprint)
+    along = ALONG[material]
+    points = np.where(fixed, world_N3, p + shift)
+    points[:, 2] *= along
+    noise = fractal_noise(points, OCTAVES[material], np.maximum(footprint, along * stretched))
     albedo = np.empty_like(p)
     for m in np.unique(material):
         s = np.flatnonzero(material == m)
         patch = Patch(
-            p[s], half[s], face[s], world_N3[s], footprint[s], solids.color_P3[index_N[s]],
+            p[s], half[s], face[s], world_N3[s], _FILTER_PX * footprint[s],
+            _FILTER_PX * stretched[s], solids.color_P3[index_N[s]],
             solids.color2_P3[index_N[s]], solids.params_P4[index_N[s]], noise[s], markings,
         )
         albedo[s] = PATCHES[Material(m)][0](patch)

@@ -54,7 +54,8 @@ class Patch:
     half_N3: FloatArray
     face_N3: FloatArray  # unit-space normal
     world_N3: FloatArray
-    footprint_N: FloatArray  # metres a pixel covers on the surface
+    footprint_N: FloatArray  # width of the texture filter across the view, metres
+    stretched_N: FloatArray  # the same along the surface's steepest way from the camera
     color_N3: FloatArray
     color2_N3: FloatArray
     params_N4: FloatArray
@@ -91,18 +92,18 @@ def _plain(s: Patch) -> FloatArray:
 def _facade(s: Patch) -> FloatArray:
     """Storeys of windows over a ground floor of another colour; a cornice; a flat dark roof."""
     storey, bay, wide, tall = s.params_N4.T
-    up, along, w = s.up_N, s.along_N + 40.0, s.footprint_N
+    up, along, w, wide_w = s.up_N, s.along_N + 40.0, s.footprint_N, s.stretched_N
     column, row = along / bay, (up - 3.6) / storey
-    window = pulses(column, wide, w / bay) * pulses(row - 0.28, tall, w / storey)
-    frame = pulses(column + 0.06, wide + 0.12, w / bay) * pulses(row - 0.2, tall + 0.14, w / storey)
+    window = pulses(column, wide, wide_w / bay) * pulses(row - 0.28, tall, w / storey)
+    frame = pulses(column + 0.06, wide + 0.12, wide_w / bay) * pulses(row - 0.2, tall + 0.14, w / storey)
     upper, ground = band(up, 3.6, 1e3, w), band(up, 0.5, 2.8, w)
     lit = cell_random(np.floor(column), np.floor(row - 0.28))
-    shown = np.clip(2 - 2 * w / storey, 0, 1)  # single windows melt into their mean when far
+    shown = np.clip(2 - 4 * wide_w / bay, 0, 1)  # single windows melt into their mean when far
     pane = _GLASS * (1 + 1.2 * shown * (lit - 0.4) + 0.5)[:, None]
     color = mix(s.color2_N3, s.color_N3, upper)
     color = mix(color, s.color_N3 * 0.5 + 0.42, frame * upper * 0.8)
     color = mix(color, pane, window * upper)
-    shop = pulses(along / (bay * 1.6), 0.7, w / (bay * 1.6)) * ground
+    shop = pulses(along / (bay * 1.6), 0.7, wide_w / (bay * 1.6)) * ground
     color = mix(color, _GLASS * 1.6, shop * 0.85)
     color = mix(color, s.color_N3 * 0.6, band(up, 3.3, 3.65, w))
     color = mix(color, s.color_N3 * 1.25, band(up - 2 * s.half_N3[:, 1], -0.5, 0.1, w))
@@ -110,15 +111,15 @@ def _facade(s: Patch) -> FloatArray:
 
 
 def _asphalt(s: Patch) -> FloatArray:
-    x, z, w = s.world_N3[:, 0], s.world_N3[:, 2], s.footprint_N
+    x, z, w, long_w = s.world_N3[:, 0], s.world_N3[:, 2], s.footprint_N, s.stretched_N
     marks, paint = s.markings, np.zeros(len(x), np.float32)
     for at, width, period, duty in marks.lines:
-        paint += band(x, at - width / 2, at + width / 2, w) * pulses(z / period, duty, 2 * w / period)
+        paint += band(x, at - width / 2, at + width / 2, w) * pulses(z / period, duty, long_w / period)
     for low, high in marks.free:
-        paint *= 1 - band(z, low, high, w)
+        paint *= 1 - band(z, low, high, long_w)
     on_road = band(x, *marks.x_range, w)
     for low, high in marks.zebras:
-        paint = np.maximum(paint, band(z, low, high, w) * pulses(x / 1.0, 0.5, w) * on_road)
+        paint = np.maximum(paint, band(z, low, high, long_w) * pulses(x / 1.0, 0.5, w) * on_road)
     rails = sum((band(x, at - 0.06, at + 0.06, w) for at in marks.rails), np.zeros_like(x))
     worn = np.clip(0.85 + 0.6 * s.noise_N, 0.4, 1) * np.clip(paint, 0, 1)
     tyres = 0.5 + 0.5 * np.cos((x - 0.75) * np.float32(2 * np.pi / 1.5))
@@ -130,9 +131,10 @@ def _asphalt(s: Patch) -> FloatArray:
 def _paving(s: Patch) -> FloatArray:
     slab = s.params_N4[:, 0]
     joint = 0.94
-    x, z, w = s.world_N3[:, 0] / slab, s.world_N3[:, 2] / slab, s.footprint_N / slab
-    solid = pulses(x, joint, w) * pulses(z, joint, w)
-    tone = 0.16 * (cell_random(np.floor(x), np.floor(z)) - 0.5) * np.clip(1.5 - 3 * w, 0, 1)
+    x, z = s.world_N3[:, 0] / slab, s.world_N3[:, 2] / slab
+    w, long_w = s.footprint_N / slab, s.stretched_N / slab
+    solid = pulses(x, joint, w) * pulses(z, joint, long_w)
+    tone = 0.16 * (cell_random(np.floor(x), np.floor(z)) - 0.5) * np.clip(1.5 - 8 * long_w, 0, 1)
     color = s.color_N3 * (0.75 + 0.25 * solid + tone)[:, None]
     edge = s.half_N3[:, 0] - np.abs(s.p_N3[:, 0])
     kerb = np.maximum(band(edge, -0.1, 0.18, s.footprint_N), 1 - s.top_N)
@@ -152,12 +154,12 @@ def _foliage(s: Patch) -> FloatArray:
 
 def _slats(s: Patch) -> FloatArray:
     period, duty, lying = s.params_N4[:, :3].T
-    w = s.footprint_N / period
+    w = np.where(lying > 0, s.footprint_N, s.stretched_N) / period
     x = np.where(lying > 0, s.up_N, s.along_N) / period
     slat = pulses(x, duty, w)
     up, height = s.up_N, 2 * s.half_N3[:, 1]
     rails = band(up, height - 0.12, height, s.footprint_N) + band(up, 0.1, 0.2, s.footprint_N)
-    posts = pulses(s.along_N / 2.4, 0.06, s.footprint_N / 2.4)
+    posts = pulses(s.along_N / 2.4, 0.06, s.stretched_N / 2.4)
     share = np.clip(slat + rails + posts, 0, 1) * (1 - s.top_N) + s.top_N
     return mix(s.color2_N3, s.color_N3, share)
 
@@ -165,11 +167,11 @@ def _slats(s: Patch) -> FloatArray:
 def _masonry(s: Patch) -> FloatArray:
     """Courses of blocks under a lighter coping."""
     course = s.params_N4[:, 0]
-    w = s.footprint_N / course
+    w, wide_w = s.footprint_N / course, s.stretched_N / course
     row = s.up_N / course
     column = s.along_N / (2.2 * course) + 0.5 * (np.floor(row) % 2)
-    solid = pulses(row, 0.88, w) * pulses(column, 0.94, w / 2.2)
-    tone = 0.25 * (cell_random(np.floor(column), np.floor(row)) - 0.5) * np.clip(1.5 - 3 * w, 0, 1)
+    solid = pulses(row, 0.88, w) * pulses(column, 0.94, wide_w / 2.2)
+    tone = 0.25 * (cell_random(np.floor(column), np.floor(row)) - 0.5) * np.clip(1.5 - 6 * wide_w, 0, 1)
     color = mix(s.color2_N3, s.color_N3 * (1 + tone)[:, None], solid)
     height = 2 * s.half_N3[:, 1]
     coping = np.maximum(band(s.up_N, height - 0.16, height + 1, s.footprint_N), s.top_N)
@@ -182,7 +184,7 @@ def _body(s: Patch) -> FloatArray:
     share, ws = up / height, w / height
     color = mix(s.color_N3, _DARK * 2 + 0 * s.color_N3, band(share, -1, 0.16, ws))
     side = np.abs(s.face_N3[:, 0]) > 0.7
-    doors = pulses((s.p_N3[:, 2] + 0.55) / 1.1, 0.04, w / 1.1) * side
+    doors = pulses((s.p_N3[:, 2] + 0.55) / 1.1, 0.04, s.stretched_N / 1.1) * side
     color = mix(color, color * 0.55, doors * 0.8)
     across = np.abs(s.p_N3[:, 0]) / s.half_N3[:, 0]
     wx = w / s.half_N3[:, 0]
@@ -202,7 +204,7 @@ def _cabin(s: Patch) -> FloatArray:
     across = np.abs(s.along_N) / np.where(np.abs(s.face_N3[:, 0]) > np.abs(s.face_N3[:, 2]),
                                           s.half_N3[:, 2], s.half_N3[:, 0])
     pane = band(s.up_N / height, low, high, w / height) * band(across, -1, 1 - pillar, w)
-    split = pulses(s.p_N3[:, 2] / 1.2 + 0.05, 0.1, w / 1.2) * (np.abs(s.face_N3[:, 0]) > 0.5)
+    split = pulses(s.p_N3[:, 2] / 1.2 + 0.05, 0.1, s.stretched_N / 1.2) * (np.abs(s.face_N3[:, 0]) > 0.5)
     glass = np.clip(pane - split, 0, 1) * (np.abs(s.face_N3[:, 1]) < 0.9)
     return mix(s.color_N3, _GLASS * 1.2 + 0 * s.color_N3, glass)
 
@@ -214,7 +216,7 @@ def _coach(s: Patch) -> FloatArray:
     share, ws = s.up_N / height, w / height
     side = (np.abs(s.face_N3[:, 0]) > 0.7).astype(w.dtype)
     color = mix(s.color_N3, s.color2_N3, band(share, 0.06, 0.06 + stripe, ws))
-    row = band(share, low, high, ws) * pulses(s.along_N / bay, 0.86, w / bay) * side
+    row = band(share, low, high, ws) * pulses(s.along_N / bay, 0.86, s.stretched_N / bay) * side
     across = np.abs(s.p_N3[:, 0]) / s.half_N3[:, 0]
     ends = (1 - side) * band(across, -1, 0.9, w)
     screen = band(share, low - 0.06, high + 0.02, ws) * ends
@@ -282,22 +284,26 @@ def _roof(s: Patch) -> FloatArray:
 
 #: function, noise strength per wavelength (6.4, 2.3, .85, .32, .12, .045 m)
 PATCHES: dict[Material, tuple[Callable[[Patch], FloatArray], tuple[float, ...]]] = {
-    Material.PLAIN: (_plain, (0.05, 0.08, 0.1, 0.12, 0.1, 0.1)),
-    Material.FACADE: (_facade, (0.2, 0.18, 0.2, 0.16, 0.12, 0.12)),
-    Material.ASPHALT: (_asphalt, (0.18, 0.22, 0.24, 0.24, 0.22, 0.25)),
-    Material.PAVING: (_paving, (0.15, 0.2, 0.22, 0.2, 0.18, 0.2)),
-    Material.GRASS: (_grass, (0.25, 0.3, 0.35, 0.4, 0.4, 0.4)),
-    Material.FOLIAGE: (_foliage, (0.0, 0.3, 0.6, 0.6, 0.5, 0.4)),
-    Material.SLATS: (_slats, (0.15, 0.15, 0.15, 0.15, 0.12, 0.1)),
-    Material.MASONRY: (_masonry, (0.2, 0.2, 0.22, 0.2, 0.15, 0.15)),
-    Material.BODY: (_body, (0.0, 0.06, 0.08, 0.08, 0.05, 0.05)),
-    Material.CABIN: (_cabin, (0.0, 0.06, 0.1, 0.08, 0.05, 0.05)),
-    Material.COACH: (_coach, (0.04, 0.08, 0.1, 0.08, 0.05, 0.05)),
+    Material.PLAIN: (_plain, (0.1, 0.2, 0.25, 0.25, 0.2, 0.15)),
+    Material.FACADE: (_facade, (0.6, 0.6, 0.5, 0.35, 0.25, 0.2)),
+    Material.ASPHALT: (_asphalt, (0.7, 0.9, 0.8, 0.6, 0.45, 0.35)),
+    Material.PAVING: (_paving, (0.3, 0.4, 0.4, 0.35, 0.3, 0.25)),
+    Material.GRASS: (_grass, (0.4, 0.5, 0.5, 0.5, 0.45, 0.4)),
+    Material.FOLIAGE: (_foliage, (0.1, 0.5, 0.8, 0.7, 0.55, 0.4)),
+    Material.SLATS: (_slats, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
+    Material.MASONRY: (_masonry, (0.35, 0.4, 0.4, 0.3, 0.25, 0.2)),
+    Material.BODY: (_body, (0.0, 0.15, 0.2, 0.15, 0.1, 0.05)),
+    Material.CABIN: (_cabin, (0.0, 0.15, 0.2, 0.15, 0.1, 0.05)),
+    Material.COACH: (_coach, (0.1, 0.2, 0.22, 0.16, 0.1, 0.05)),
     Material.SIGN: (_sign, (0.0, 0.0, 0.06, 0.06, 0.05, 0.05)),
     Material.LAMPS: (_lamps, (0.0, 0.0, 0.06, 0.06, 0.05, 0.05)),
     Material.PERSON: (_person, (0.0, 0.1, 0.2, 0.25, 0.25, 0.15)),
     Material.WHEEL: (_wheel, (0.0, 0.0, 0.1, 0.1, 0.1, 0.1)),
     Material.HEAD: (_head, (0.0, 0.0, 0.05, 0.05, 0.05, 0.05)),
-    Material.ROOF: (_roof, (0.12, 0.15, 0.18, 0.15, 0.12, 0.1)),
+    Material.ROOF: (_roof, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
 }
+#: share of the street's direction in the noise: wear runs along the road, and a pixel is long there
+STRETCH = {Material.ASPHALT: 0.35, Material.PAVING: 0.35, Material.GRASS: 0.35}
+STRETCH |= dict.fromkeys((Material.FACADE, Material.SLATS, Material.MASONRY), 0.6)
 OCTAVES = np.array([PATCHES[m][1] for m in Material], np.float32)
+ALONG = np.array([STRETCH.get(m, 1.0) for m in Material], np.float32)

@@ -28,7 +28,7 @@ def render_all(root: Path, settings: Settings, processes: int | None, progress: 
     """Write every scene and the summaries under `root`.
 
     Raises:
-        RuntimeError: a worker died; holds what it wrote to stderr.
+        RuntimeError: a worker died; it has written why to stderr.
     """
     total = len(settings.scenes)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -60,20 +60,18 @@ def _children(root: Path, settings: Settings, count: int) -> Iterator[dict[str, 
     path = os.pathsep.join(filter(None, (package_root, os.environ.get("PYTHONPATH"))))
     environment = {**os.environ, **_SINGLE, "PYTHONPATH": path}
     lines: queue.Queue[str | int] = queue.Queue()
-    errors: list[str] = [""] * count
 
     def start(number: int) -> subprocess.Popen[str]:
         job = {"root": str(root.resolve()), "settings": asdict(settings), "first": number, "step": count}
         return subprocess.Popen(
             [sys.executable, "-m", "mtl_bench.data.synthetic", json.dumps(job)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+            stdout=subprocess.PIPE, text=True, env=environment,
         )  # fmt: skip
 
     def listen(number: int, child: subprocess.Popen[str]) -> None:
-        assert child.stdout is not None and child.stderr is not None
+        assert child.stdout is not None
         for line in child.stdout:
             lines.put(line)
-        errors[number] = child.stderr.read()
         child.wait()
         lines.put(number)
 
@@ -89,7 +87,7 @@ def _children(root: Path, settings: Settings, count: int) -> Iterator[dict[str, 
                 continue
             running -= 1
             if children[line].returncode:
-                raise RuntimeError(f"a rendering process failed:\n{errors[line]}")
+                raise RuntimeError("a rendering process failed; its message stands above")
     finally:
         for child in children:
             child.kill()

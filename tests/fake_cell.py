@@ -1,0 +1,62 @@
+"""Stands in for `mtl_bench train` in tests of the launcher: claims, reports, writes a row.
+
+    python fake_cell.py ACTION SECONDS CODE_JSON CELL.JSON
+
+Every start and end leaves a line in `history.txt` beside the run directories.
+"""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from mtl_bench import claim, results
+from mtl_bench.launch import CLAIMED
+
+
+def note(directory: Path, word: str) -> None:
+    threads = os.environ.get("OMP_NUM_THREADS", "-")
+    with (directory.parent / "history.txt").open("a") as file:
+        file.write(f"{word} {directory.name} {time.time()} {threads} {os.getpid()}\n")
+
+
+def interrupt(number, frame):
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    action, seconds, code, file = sys.argv[1:]
+    signal.signal(signal.SIGTERM, interrupt)
+    directory = Path(file).parent
+    if action == "silent":
+        sys.exit(0)
+    try:
+        with claim.claim(directory):
+            if (directory / "row.json").exists():
+                return
+            note(directory, "start")
+            results.write_json(directory / "code.json", json.loads(code))
+            state = {"stage": "train", "step": 1, "steps": 2, "seconds": 1.0, "note": "loss 1"}
+            results.write_json(directory / "progress.json", state)
+            time.sleep(float(seconds))
+            if action == "fail":
+                results.write_failure(directory, "ValueError: on purpose", "Traceback ...")
+                sys.exit(1)
+            if action == "crash":
+                print("about to crash", flush=True)
+                os.kill(os.getpid(), signal.SIGKILL)
+            metric = {"panoptic.pq": 0.25, "latency.fps": 10.0}
+            row = {"metric": metric, "code": json.loads(code), "time": {"train_s": 3600.0}}
+            results.write_json(directory / "row.json", row)
+            note(directory, "end")
+    except claim.ClaimedError:
+        sys.exit(CLAIMED)
+    except KeyboardInterrupt:
+        note(directory, "saved")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,218 @@
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mtl_bench import plugins
+from mtl_bench.config import Cell, Recipe
+
+METHOD = '''"""Doubles everything.
+
+Source: a test.
+"""
+
+from mtl_bench.method import LossMethod
+
+
+class Mine(LossMethod):
+    def __init__(self, terms, seed=0, factor=2.0):
+        super().__init__(terms, seed)
+        self.factor = factor
+
+    def total(self, loss_T):
+        return self.factor * loss_T.sum()
+'''
+
+
+@pytest.fixture(autouse=True)
+def isolated(tmp_path, monkeypatch):
+    """An empty working directory, and no plug-in folders but the package's own."""
+    monkeypatch.setenv(plugins.VARIABLE, "")
+    monkeypatch.chdir(tmp_path)
+
+
+def put(path, text=METHOD):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def described(name, kind="methods"):
+    return next(d for d in plugins.describe(kind) if d.name == name)
+
+
+def test_the_checkout_is_searched_first_and_not_a_copy_in_site_packages():
+    checkout = plugins.PACKAGE.parent
+    assert plugins.folders("methods")[0] == checkout / "methods"
+    assert plugins.folders("backbones")[0] == checkout / "backbones"
+    assert plugins.path_of("methods", "fixed") == checkout / "methods" / "fixed.py"
+
+
+def test_an_installed_wheel_has_its_own_folders(tmp_path, monkeypatch):
+    package = tmp_path / "site-packages" / "mtl_bench"
+    put(package / "_shipped" / "methods" / "only.py")
+    put(tmp_path / "site-packages" / "methods" / "stranger.py")
+    monkeypatch.setattr(plugins, "PACKAGE", package)
+    assert list(plugins.files("methods")) == ["only"]
+
+
+def test_every_file_of_the_checkout_is_described_and_loads():
+    for kind in plugins.KINDS:
+        found = plugins.describe(kind)
+        assert found
+        for d in found:
+            assert d.error is None, (d.name, d.error)
+            assert len(d.summary) > 10
+            assert plugins.load(kind, d.name).__module__.endswith(f".{d.name}")
+
+
+def test_working_directory(tmp_path):
+    put(tmp_path / "methods" / "mine.py")
+    assert described("mine").summary == "Doubles everything."
+    assert plugins.load("methods", "mine").__name__ == "Mine"
+    assert plugins.settings("methods", "mine") == {"factor": 2.0}
+    assert "mine" not in plugins.files("backbones")
+
+
+@pytest.mark.parametrize("place", ["extra/methods/mine.py", "extra/mine.py"])
+@pytest.mark.parametrize("given", ["extra", "extra/", "./extra"])
+def test_added_folder(tmp_path, place, given):
+    put(tmp_path / place)
+    plugins.add_folder(given)
+    assert plugins.files("methods")["mine"] == tmp_path / place
+    assert "mine" not in plugins.files("backbones")
+    assert plugins.load("methods", "mine").__name__ == "Mine"
+
+
+def test_added_file_and_kind_by_import(tmp_path):
+    text = "from mtl_bench.model import Backbone\n\nclass Net(Backbone): ...\n"
+    plugins.add_folder(put(tmp_path / "odd" / "net.py", text))
+    assert plugins.kinds_of("net") == ["backbones"]
+    put(tmp_path / "odd" / "notes.py", "x = 1\n")
+    plugins.add_folder(tmp_path / "odd")
+    assert plugins.kinds_of("notes") == []
+
+
+def test_a_folder_reached_twice_counts_once(tmp_path):
+    path = put(tmp_path / "methods" / "mine.py")
+    plugins.add_folder(tmp_path)
+    plugins.add_folder(tmp_path / "methods")
+    plugins.add_folder(path)
+    (tmp_path / "link").symlink_to(tmp_path / "methods")
+    plugins.add_folder(tmp_path / "link")
+    assert plugins.path_of("methods", "mine") == path
+
+
+def test_one_name_in_two_folders_names_both_when_chosen(tmp_path):
+    here = put(tmp_path / "methods" / "mine.py")
+    there = put(tmp_path / "extra" / "methods" / "mine.py")
+    plugins.add_folder("extra")
+    assert str(here) in described("mine").error
+    with pytest.raises(ValueError, match="two methods are called 'mine'") as caught:
+        plugins.load("methods", "mine")
+    assert str(here) in str(caught.value)
+    assert str(there) in str(caught.value)
+    plugins.load("methods", "fixed")  # hurts nobody else
+
+
+def test_unknown_name():
+    with pytest.raises(ValueError, match=r"'fixd' \(did you mean 'fixed'\?\).*methods/fixd.py"):
+        plugins.path_of("methods", "fixd")
+    with pytest.raises(ValueError, match="no plug-in folder"):
+        plugins.add_folder("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("def (:\n", "SyntaxError"),
+        ("x = 1\n", "defines no class"),
+        ("import not_installed_xyz\n\nclass A: ...\n", "needs not_installed_xyz"),
+    ],
+)
+def test_a_broken_file_is_listed_as_broken(tmp_path, text, why):
+    put(tmp_path / "methods" / "broken.py", text)
+    assert why in described("broken").error
+    assert described("fixed").error is None
+
+
+def test_impossible_name_is_listed_as_broken(tmp_path):
+    put(tmp_path / "methods" / "No-name.py")
+    assert "is no name" in described("No-name").error
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("def (:\n", "SyntaxError"),
+        ("\n1 / 0\n", "line 2: ZeroDivisionError"),
+        ("import not_installed_xyz\n", "No module named 'not_installed_xyz'"),
+        ("class A: ...\n", "must define one subclass of Method, and defines none"),
+        (METHOD + "\n\nclass Two(Mine): ...\n", "one subclass of Method, and defines Mine, Two"),
+        ("from mtl_bench.method import LossMethod\n", "defines none"),
+    ],
+)
+def test_a_broken_file_says_why_when_chosen(tmp_path, text, why):
+    put(tmp_path / "methods" / "broken.py", text)
+    with pytest.raises(ValueError, match=why):
+        plugins.load("methods", "broken")
+
+
+def test_helpers_belong_to_their_folder(tmp_path):
+    """Two folders may each have a `_common.py`; neither is a plug-in."""
+    for folder, value in (("one", 1), ("two", 2)):
+        put(tmp_path / folder / "methods" / "_common.py", f"VALUE = {value}\n")
+        text = METHOD.replace("class Mine", "from ._common import VALUE\n\n\nclass Mine")
+        text = text.replace("    def __init__", "    value = VALUE\n\n    def __init__")
+        put(tmp_path / folder / "methods" / f"mine_{folder}.py", text)
+        plugins.add_folder(folder)
+    assert plugins.load("methods", "mine_one").value == 1
+    assert plugins.load("methods", "mine_two").value == 2
+    assert "_common" not in plugins.files("methods")
+
+
+def test_fingerprint_covers_file_and_helpers_and_nothing_else(tmp_path):
+    path = put(tmp_path / "methods" / "mine.py")
+    before = plugins.fingerprint("methods", "mine")
+    assert len(before) == 12
+    put(tmp_path / "methods" / "neighbour.py")
+    assert plugins.fingerprint("methods", "mine") == before
+    helper = put(tmp_path / "methods" / "_common.py", "x = 1\n")
+    with_helper = plugins.fingerprint("methods", "mine")
+    helper.write_text("x = 2\n")
+    assert len({before, with_helper, plugins.fingerprint("methods", "mine")}) == 3
+    helper.unlink()
+    path.write_text(METHOD + "# a change\n")
+    assert plugins.fingerprint("methods", "mine") != before
+
+
+def test_an_edited_file_is_loaded_anew(tmp_path):
+    put(tmp_path / "methods" / "mine.py")
+    first = plugins.load("methods", "mine")
+    assert plugins.load("methods", "mine") is first
+    put(tmp_path / "methods" / "mine.py", METHOD.replace("factor=2.0", "factor=30.0"))
+    assert plugins.settings("methods", "mine") == {"factor": 30.0}
+
+
+def test_hyper_parameters_are_checked_against_the_constructor(tmp_path):
+    put(tmp_path / "methods" / "mine.py")
+    good = Cell(Recipe(), "tiny", "mine", method_args={"factor": 3.0})
+    plugins.check_cells([good])
+    with pytest.raises(ValueError, match=r"method 'mine' has no 'facto' \(did you mean 'factor'"):
+        plugins.check_cells([Cell(Recipe(), "tiny", "mine", method_args={"facto": 3.0})])
+    with pytest.raises(ValueError, match="method 'mine' has no 'seed'"):
+        plugins.check_cells([Cell(Recipe(), "tiny", "mine", method_args={"seed": 3})])
+    with pytest.raises(ValueError, match="no backbone called 'tny'"):
+        plugins.check_cells([Cell(Recipe(), "tny", "mine")])
+
+
+def test_children_find_added_folders_and_describing_imports_nothing(tmp_path):
+    put(tmp_path / "extra" / "methods" / "mine.py")
+    plugins.add_folder("extra")
+    code = (
+        "import sys; from mtl_bench import plugins\n"
+        "names = [d.name for kind in plugins.KINDS for d in plugins.describe(kind)]\n"
+        "assert 'mine' in names and not {'torch', 'timm'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd="/", env=os.environ)

@@ -1,0 +1,232 @@
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from mtl_bench import claim, plugins, provenance, results
+from mtl_bench.config import Cell, Recipe
+
+METHOD = "from mtl_bench.method import LossMethod\n\n\nclass Mine(LossMethod): ...\n"
+
+
+@pytest.fixture
+def cell(tmp_path, monkeypatch):
+    """A cell whose method can be edited."""
+    monkeypatch.setenv(plugins.VARIABLE, "")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "methods").mkdir()
+    (tmp_path / "methods" / "mine.py").write_text(METHOD)
+    return Cell(Recipe(), "tiny", "mine")
+
+
+@pytest.fixture
+def directory(cell, tmp_path):
+    path = results.run_dir(cell, tmp_path / "runs")
+    path.mkdir(parents=True)
+    return path
+
+
+def write_row(directory, cell):
+    results.write_json(
+        directory / "row.json", {"metric": {"panoptic.pq": 0.5}, "code": provenance.code(cell)}
+    )
+
+
+def test_write_json_leaves_the_old_file_or_the_new_one(tmp_path):
+    path = tmp_path / "value.json"
+    results.write_json(path, {"a": 1})
+    with pytest.raises(TypeError):
+        results.write_json(path, {"a": object()})
+    assert results.read_json(path) == {"a": 1}
+
+
+def test_status_follows_what_is_in_the_directory(cell, tmp_path):
+    runs = tmp_path / "runs"
+    assert results.status(cell, runs) == "missing"
+    directory = results.run_dir(cell, runs)
+    directory.mkdir(parents=True)
+    assert results.status(cell, runs) == "missing"
+    results.begin(cell, runs)
+    assert results.status(cell, runs) == "interrupted"
+    with claim.claim(directory):
+        assert results.status(cell, runs) == "running"
+    results.write_failure(directory, "ValueError: bad", "line\n" * 100, 1)
+    state = results.inspect(cell, runs)
+    assert (state.word, state.why) == ("failed", "ValueError: bad")
+    assert len(results.read_json(directory / "failed.json")["traceback"].splitlines()) == 30
+    write_row(directory, cell)
+    assert results.status(cell, runs) == "done"
+
+
+def test_row_is_stale_when_its_code_changed(cell, directory, tmp_path, monkeypatch):
+    write_row(directory, cell)
+    runs = tmp_path / "runs"
+    method = tmp_path / "methods" / "mine.py"
+    method.write_text(METHOD + "# changed\n")
+    state = results.inspect(cell, runs)
+    assert (state.word, state.why) == ("stale", "methods/mine.py changed")
+    assert state.row is not None
+    method.write_text(METHOD)
+    assert results.status(cell, runs) == "done"
+    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "other")
+    assert results.inspect(cell, runs).why == "harness changed"
+    method.unlink()
+    assert "no method called 'mine'" in results.inspect(cell, runs).why
+
+
+def test_harness_is_every_module_that_makes_numbers(tmp_path):
+    package = provenance.PACKAGE
+    for name in provenance.HARNESS:
+        assert (package / name).exists(), name
+    for name in ("data/labels.py", "method.py"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("x = 1\n")
+    before = provenance.harness_fingerprint(tmp_path)
+    (tmp_path / "cli.py").write_text("not among them")
+    assert provenance.harness_fingerprint(tmp_path) == before
+    (tmp_path / "data" / "labels.py").write_text("x = 2\n")
+    assert provenance.harness_fingerprint(tmp_path) != before
+
+
+def test_begin_continues_its_own_checkpoint_and_drops_that_of_other_code(cell, tmp_path):
+    runs = tmp_path / "runs"
+    results.run_dir(cell, runs).mkdir(parents=True)
+    directory, why = results.begin(cell, runs)
+    assert why == ""
+    (directory / "last.pt").write_text("state")
+    (directory / "log.txt").write_text("log")
+    results.write_failure(directory, "out of memory")
+    assert results.begin(cell, runs) == (directory, "")
+    assert (directory / "last.pt").exists()
+    assert not (directory / "failed.json").exists()
+    (tmp_path / "methods" / "mine.py").write_text(METHOD + "# changed\n")
+    assert results.begin(cell, runs)[1] == "methods/mine.py changed"
+    assert not (directory / "last.pt").exists()
+    assert (directory / "log.txt").exists()
+
+
+def test_cell_file_gives_the_cell_back(cell, tmp_path):
+    results.run_dir(cell, tmp_path).mkdir()
+    directory, _ = results.begin(cell, tmp_path)
+    assert results.load_cell(directory / "cell.json") == cell
+    (directory / "cell.json").write_text('{"recipe": {}, "sed": 1}')
+    with pytest.raises(ValueError, match=r"cell.json is not a cell: .*did you mean 'seed'"):
+        results.load_cell(directory / "cell.json")
+    with pytest.raises(ValueError, match="no cell file"):
+        results.load_cell(tmp_path / "gone.json")
+
+
+def test_damaged_row_is_an_error_that_names_it(cell, directory, tmp_path):
+    (directory / "row.json").write_text('{"metric":')
+    with pytest.raises(ValueError, match=r"row.json is damaged"):
+        results.status(cell, tmp_path / "runs")
+
+
+def test_rows_of_a_grid_have_todays_status(cell, directory, tmp_path):
+    other = Cell(Recipe(), "tiny", "mine", seed=1)
+    write_row(directory, cell)
+    first, second = results.rows([cell, other], tmp_path / "runs")
+    assert (first["status"], first["metric"]) == ("done", {"panoptic.pq": 0.5})
+    assert (second["status"], second["seed"], "metric" in second) == ("missing", 1, False)
+    assert second["cell"]["backbone"] == "tiny"
+
+
+# --- claims ---------------------------------------------------------------------------------------
+
+
+def write_claim(directory, pid, machine=None, age_s=0.0):
+    owner = {"pid": pid, "machine": machine or claim._machine()}
+    (directory / "claim").write_text(json.dumps(owner))
+    os.utime(directory / "claim", (time.time() - age_s,) * 2)
+
+
+def dead_pid():
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_claim_is_exclusive_and_goes_with_the_block(directory):
+    with claim.claim(directory):
+        assert claim.claimed_by(directory)["pid"] == os.getpid()
+        with pytest.raises(claim.ClaimedError, match=str(os.getpid())), claim.claim(directory):
+            pass
+        assert claim.claimed_by(directory) is not None
+    assert not (directory / "claim").exists()
+
+
+def test_claim_of_a_dead_process_is_void_at_once(directory):
+    write_claim(directory, dead_pid())
+    assert claim.claimed_by(directory) is None
+    with claim.claim(directory):
+        assert claim.claimed_by(directory)["pid"] == os.getpid()
+    assert list(directory.iterdir()) == []
+
+
+def test_claim_of_a_killed_process_nobody_waited_for_is_void(directory):
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    write_claim(directory, process.pid)
+    assert claim.claimed_by(directory) is not None
+    process.kill()
+    deadline = time.monotonic() + 10
+    while claim.claimed_by(directory) is not None:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.wait()
+
+
+def test_claim_of_another_machine_is_void_ten_minutes_after_it_was_renewed(directory):
+    write_claim(directory, 1, "elsewhere", age_s=500)
+    assert claim.claimed_by(directory) is not None
+    write_claim(directory, 1, "elsewhere", age_s=700)
+    assert claim.claimed_by(directory) is None
+
+
+def test_half_written_claim_counts_for_a_moment(directory):
+    (directory / "claim").write_text("")
+    assert claim.claimed_by(directory) == {}
+    os.utime(directory / "claim", (time.time() - 60,) * 2)
+    assert claim.claimed_by(directory) is None
+
+
+# --- provenance -----------------------------------------------------------------------------------
+
+
+def test_command_line_names_no_place_of_this_machine():
+    argv = ["/home/someone/bin/mtl-bench", "train", "runs/x/cell.json", "--data", "/mnt/cs"]
+    argv += ["--plugins=/home/someone/mine", "--set", "recipe.optim.lr=3e-4", "../someone/a.toml"]
+    assert provenance.command_line(argv) == (
+        "mtl-bench train runs/x/cell.json --data cs --plugins=mine "
+        "--set recipe.optim.lr=3e-4 a.toml"
+    )
+
+
+def test_environment_tells_versions_and_hardware_and_no_names():
+    import getpass
+    import platform
+
+    found = provenance.environment("cpu")
+    assert found["torch"]
+    assert found["threads"] >= 1
+    assert found["device"] == found["cpu"]
+    text = json.dumps({key: value for key, value in found.items() if key != "cpu"})
+    assert platform.node() not in text
+    assert f"/{getpass.getuser()}" not in text
+
+
+def test_git_state(tmp_path):
+    assert provenance.git_state(tmp_path) == (None, None)
+    for words in (["init", "-q"], ["config", "user.email", "a@b.c"], ["config", "user.name", "n"]):
+        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    (tmp_path / "file").write_text("1")
+    subprocess.run(["git", "add", "file"], cwd=tmp_path, check=True)
+    subprocess.run(["git", "commit", "-qm", "one"], cwd=tmp_path, check=True)
+    commit, dirty = provenance.git_state(tmp_path)
+    assert len(commit) == 40
+    assert dirty is False
+    (tmp_path / "file").write_text("2")
+    assert provenance.git_state(tmp_path) == (commit, True)
