@@ -221,7 +221,7 @@ def _cost(stages: list[Stage], host: Tensor, device: torch.device) -> dict[str, 
 
 
 def _peak(stages: list[Stage], host: Tensor, device: torch.device) -> tuple[int, str]:
-    """Most bytes that one pass holds at once beyond the weights, and how that was found.
+    """Most bytes that a pass over one image holds beyond the weights, and how that was found.
 
     On CUDA by the caching allocator, operator workspaces included. On the CPU by the sizes of the
     tensors alive at once, which leaves out the workspaces inside operators: a resident set size

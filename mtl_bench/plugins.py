@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.config import Cell, did_you_mean
+from mtl_bench.config import TASKS, Cell, did_you_mean
 
 KINDS = ("methods", "backbones")
 PACKAGE = Path(__file__).resolve().parent
@@ -228,13 +228,18 @@ def settings(kind: str, name: str) -> dict[str, Any]:
 
 
 def check_cells(cells: Iterable[Cell]) -> None:
-    """The plug-ins that cells name exist and have the hyper-parameters that are set.
+    """What cells name exists: tasks, plug-ins and the hyper-parameters that are set.
 
     Raises:
-        ValueError: an unknown plug-in or hyper-parameter, with the nearest known one.
+        ValueError: an unknown task, plug-in or hyper-parameter, with the nearest known one.
     """
     seen: set[tuple[str, str, tuple[str, ...]]] = set()
     for cell in cells:
+        for task in cell.tasks:
+            if task not in TASKS:
+                raise ValueError(f"no task called '{task}'{did_you_mean(task, TASKS)}")
+        if not cell.tasks:
+            raise ValueError(f"a cell needs a task: {', '.join(TASKS)}")
         chosen: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
             ("methods", cell.method, cell.method_args),
             ("backbones", cell.backbone, cell.backbone_args),

@@ -12,12 +12,15 @@ from cityscapesscripts.evaluation import evalPanopticSemanticLabeling as csEval
 from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 
+from mtl_bench import postprocess
 from mtl_bench.baselines import Average, baselines
 from mtl_bench.config import Cell, Data, Evaluate, Loss, Recipe
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, IGNORE
+from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.data.targets import panoptic_targets
 from mtl_bench.evaluate import evaluate
-from mtl_bench.export_predictions import export_predictions
+from mtl_bench.export_predictions import export_predictions, write_panoptic
+from mtl_bench.metrics.panoptic import PanopticQuality
 from mtl_bench.model import Outputs
 
 HEIGHT, WIDTH, FRAMES = 64, 128, 5
@@ -301,23 +304,54 @@ def test_the_official_evaluator_agrees_on_exported_predictions(root, tmp_path):
     expected = evaluate(model, CELL, root, CPU, batch_size=2).metrics
     results = export_predictions(model, CELL, root, tmp_path / "out", CPU, batch_size=2)
     convert2panoptic(str(root / "gtFine"), str(tmp_path), setNames=["val"])
-    truth = json.loads((tmp_path / "cityscapes_panoptic_val.json").read_text())
-    predictions = json.loads(results.read_text())["annotations"]
-    assert [item["image_id"] for item in predictions] == [
-        item["image_id"] for item in truth["annotations"]
-    ]
-    categories = {item["id"]: item for item in truth["categories"]}
-    statistics = csEval.pq_compute_single_core(
-        0,
-        list(zip(truth["annotations"], predictions, strict=True)),
-        str(tmp_path / "cityscapes_panoptic_val"),
-        str(results.with_suffix("")),
-        categories,
-    )
-    official = csEval.average_pq(statistics, categories)
+    official = official_quality(tmp_path / "cityscapes_panoptic_val.json", results)
     assert 0 < official["All"]["pq"] < 1
-    assert expected["panoptic.pq"] / 100 == pytest.approx(official["All"]["pq"], abs=1e-9)
-    assert expected["panoptic.pq_things"] / 100 == pytest.approx(official["Things"]["pq"], abs=1e-9)
+    for key, part in (("pq", "All"), ("pq_things", "Things"), ("pq_stuff", "Stuff")):
+        assert expected[f"panoptic.{key}"] / 100 == pytest.approx(official[part]["pq"], abs=1e-9)
+
+
+def official_quality(truth_json: Path, results_json: Path):
+    """Cityscapes' own evaluation, in this process."""
+    truth = json.loads(truth_json.read_text())
+    predictions = {p["image_id"]: p for p in json.loads(results_json.read_text())["annotations"]}
+    categories = {item["id"]: item for item in truth["categories"]}
+    pairs = [(item, predictions[item["image_id"]]) for item in truth["annotations"]]
+    folders = str(truth_json.with_suffix("")), str(results_json.with_suffix(""))
+    statistics = csEval.pq_compute_single_core(0, pairs, *folders, categories)
+    return csEval.average_pq(statistics, categories)
+
+
+# --- the built-in data ----------------------------------------------------------------------------
+
+
+def truth_through_grouping(root, cell, damage):
+    """(name, predicted ids, true ids) of the split: truth -> targets -> grouping."""
+    ev = replace(cell.recipe.evaluate, stuff_area=0)
+    dataset = open_dataset(cell, "val", root, training=False)
+    for batch in eval_batches(dataset, 1):
+        ids = batch.instance_ids_BHW[0].numpy()
+        targets = panoptic_targets(ids, CITYSCAPES20, cell.recipe.loss)
+        classes = np.where((ids > 23) & (ids < 1000), IGNORE, targets.semantic)  # crowds
+        classes = np.roll(classes, damage, 1)
+        maps = [torch.from_numpy(x)[None] for x in (classes, targets.center[None], targets.offset)]
+        panoptic = postprocess.panoptic(*maps, CITYSCAPES20.things, ev)
+        predicted = postprocess.to_instance_ids(panoptic, CITYSCAPES20)[0].numpy()
+        yield batch.names[0], predicted, ids
+
+
+@pytest.mark.parametrize("damage", [0, 2])
+def test_the_built_in_truth_is_perfect_and_the_official_evaluator_agrees(
+    smoke_root, smoke_cell, tmp_path, damage
+):
+    frames = list(truth_through_grouping(smoke_root, smoke_cell, damage))
+    quality = PanopticQuality(CITYSCAPES20)
+    for _, predicted, true in frames:
+        quality.update(predicted, true)
+    result = quality.compute()["pq"]
+    assert result == 100.0 if damage == 0 else 20 < result < 95
+    results = write_panoptic(tmp_path, "val", [frame[:2] for frame in frames])
+    official = official_quality(smoke_root / "gtFine/cityscapes_panoptic_val.json", results)
+    assert result / 100 == pytest.approx(official["All"]["pq"], abs=1e-9)
 
 
 def test_nothing_panoptic_nothing_to_export(root, tmp_path):

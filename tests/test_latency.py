@@ -23,6 +23,7 @@ class FakeNet(nn.Module):
 
     def __init__(self, tasks: tuple[str, ...]) -> None:
         super().__init__()
+        torch.manual_seed(0)
         self.tasks = tasks
         self.conv = nn.Conv2d(3, CLASSES + 4, 3, padding=1, bias=False)
         self.auxiliary = nn.Conv2d(3, 1, 1)
@@ -152,11 +153,13 @@ def test_peak_memory_counts_what_is_alive_at_once():
 
 
 def test_peak_includes_weights_and_grows_with_the_image():
-    small, large = measure(), measure(timing=dataclasses.replace(TIMING, height=64, width=128))
+    model = FakeModel(("depth",))  # grouping depends on what is seen, depth on the size alone
+    small = measure(model)
+    large = measure(model, dataclasses.replace(TIMING, height=2 * HEIGHT, width=2 * WIDTH))
     weights_mib = (CLASSES + 4) * 3 * 9 * 4 / latency.MIB
     maps_mib = (CLASSES + 4) * HEIGHT * WIDTH * 4 / latency.MIB
     assert small["latency.peak_mib"] > weights_mib + maps_mib
-    assert large["latency.peak_mib"] > 3 * small["latency.peak_mib"]
+    assert large["latency.peak_mib"] > 3.8 * small["latency.peak_mib"]
 
 
 def test_distinct_images_reach_the_network_as_they_are():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtl_bench import config, postprocess
+from mtl_bench import config, depth_scale, postprocess
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE
 from mtl_bench.data.targets import panoptic_targets
 from mtl_bench.metrics.panoptic import PanopticQuality
@@ -206,7 +206,7 @@ def test_scale_is_exact_on_a_plane(pitch, roll, size):
 def test_a_known_pitch_needs_no_search():
     depth, K, road = plane(pitch=0.08)  # more than is searched for
     pitch = torch.tensor([0.08])
-    for max_tilt in (0.0, postprocess.MAX_TILT):
+    for max_tilt in (0.0, depth_scale.MAX_TILT):
         scale, _ = postprocess.dgc_scale(
             depth / 2, K, torch.tensor([1.4]), road, max_tilt=max_tilt, pitch_rad_B=pitch
         )
@@ -265,5 +265,5 @@ def test_a_bend_of_the_depth_cannot_tilt_the_camera_far():
     height = torch.tensor([1.4])
     free, _ = postprocess.dgc_scale(bent, K, height, road)
     level, _ = postprocess.dgc_scale(bent, K, height, road, max_tilt=0.0)
-    lowest_ray = postprocess.BELOW_HORIZON * (HEIGHT - 1) / 2 / FOCAL
-    assert level.item() / (1 + postprocess.MAX_TILT / lowest_ray) < free.item() < level.item()
+    lowest_ray = depth_scale.BELOW_HORIZON * (HEIGHT - 1) / 2 / FOCAL
+    assert level.item() / (1 + depth_scale.MAX_TILT / lowest_ray) < free.item() < level.item()

@@ -12,7 +12,8 @@ from mtl_bench.geometry import pose_from_vector
 from mtl_bench.model.backbone import Backbone, Normalize
 from mtl_bench.model.layers import ConvNorm, init_fan_in
 
-SCALE = 0.01
+import os
+SCALE = float(os.environ.get("PS","0.01"))
 
 
 class PoseNetwork(nn.Module):

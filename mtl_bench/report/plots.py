@@ -186,7 +186,8 @@ def _curve(
     binned = [f.groupby((f["step"] - 1) // width)[["step", column]].mean() for f in frames]
     joined = pd.concat(binned).groupby(level=0)
     step, middle = joined["step"].mean(), joined[column]
-    style = {"color": look.color, "linestyle": look.dash, "alpha": 0.5 if faint else 1.0}
+    style: dict[str, Any] = {"color": look.color, "linestyle": look.dash}
+    style["alpha"] = 0.5 if faint else 1.0
     (line,) = axes.plot(step, middle.mean(), linewidth=0.8 if faint else 1.4, **style)
     if len(frames) > 1:
         axes.fill_between(

@@ -37,13 +37,13 @@ def lattice_noise(points_N3: FloatArray) -> FloatArray:
 
 
 def fractal_noise(points_N3: FloatArray, amplitude_NK: FloatArray, footprint_N: FloatArray) -> FloatArray:
-    """Sum of octaves [N]; an octave fades out while its wavelength shrinks from 10 to 5 pixels.
+    """Sum of octaves [N]; an octave fades out while its wavelength shrinks from 16 to 2 pixels.
 
-    That early, because whoever warps a frame interpolates linearly between its pixels.
+    That slowly, because a surface that comes nearer must not change its look from frame to frame.
     """
     total = np.zeros(len(points_N3), np.float32)
     for k, wavelength in enumerate(WAVELENGTHS_M):
-        weight = amplitude_NK[:, k] * np.clip(wavelength / (5 * footprint_N) - 1, 0, 1)
+        weight = amplitude_NK[:, k] * np.clip(np.log2(wavelength / (2 * footprint_N)) / 3, 0, 1)
         seen = np.flatnonzero(weight)
         if len(seen):
             shifted = points_N3[seen] * np.float32(1 / wavelength) + np.float32(7.31 * k)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtl_bench.data.synthetic import shade, street, traffic
-from mtl_bench.data.synthetic.camera import Camera, FloatArray, Motion, draw_camera, draw_motion
+from mtl_bench.data.synthetic.camera import Camera, FloatArray, Motion, Pose, draw_camera, draw_motion
 from mtl_bench.data.synthetic.cast import cast
 from mtl_bench.data.synthetic.primitives import Solids, unit_frames
 from mtl_bench.data.synthetic.texture import Markings
@@ -32,6 +32,15 @@ class Scene:
     light: shade.Light
     bonnet: tuple[float, float, float]  # edge in the middle and drop to the sides (of H), shift (of W)
     bonnet_color_3: FloatArray
+
+    def viewer(self, frame: int) -> Pose:
+        """The camera for which a frame's texture is filtered: one for every three frames.
+
+        Texture that is filtered anew for every frame sharpens as it comes nearer, and then the same
+        point has two colours. The annotated frame and its neighbours share a filter.
+        """
+        shared = frame + 1 - (frame - self.annotated + 1) % 3
+        return self.motion.poses[min(max(shared, 0), len(self.motion.poses) - 1)]
 
 
 @dataclass(frozen=True)
@@ -147,8 +156,8 @@ def _colors(
     shadows[:, :2] += shadows[:, 5:7] * time
     flat = np.stack([*shadows[:, :2].T, np.cos(shadows[:, 2]), np.sin(shadows[:, 2]), *shadows[:, 3:5].T], 1)
     out[s] = shade.surface(
-        scene.solids, scene.light, scene.markings, flat, index, unit, world, depth, ray[s],
-        1 / camera.fx,
+        scene.solids, scene.light, scene.markings, flat, index, unit, world,
+        scene.viewer(frame), 1 / camera.fx,
     )  # fmt: skip
     return out
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.data.synthetic.camera import FloatArray
+from mtl_bench.data.synthetic.camera import FloatArray, Pose
 from mtl_bench.data.synthetic.noise import fractal_noise, lattice_noise
 from mtl_bench.data.synthetic.primitives import Solids, unit_normals
 from mtl_bench.data.synthetic.texture import ALONG, OCTAVES, PATCHES, Markings, Material, Patch
@@ -71,17 +71,19 @@ def surface(
     index_N: NDArray,
     unit_N3: FloatArray,
     world_N3: FloatArray,
-    depth_N: FloatArray,
-    ray_N3: FloatArray,
+    viewer: Pose,
     pixel_rad: float,
 ) -> FloatArray:
     """Colours [N,3] of surface points given in unit and world space.
 
     Args:
         shadows: [S,6] of dark patches under things: x, z, cos and sin of the yaw, half sizes.
-        ray_N3: world directions, camera z = 1.
+        viewer: the camera for which texture is filtered.
         pixel_rad: size of a pixel at unit depth.
     """
+    away = world_N3 - viewer.position_3.astype(np.float32)
+    ahead = (away * viewer.rotation_33[:, 2].astype(np.float32)).sum(1)
+    depth_N = np.maximum(ahead, np.float32(0.4))
     kind = solids.kind_P[index_N]
     face = unit_normals(kind, unit_N3, solids.taper_P3[index_N])
     half = solids.half_P3.astype(np.float32)[index_N]
@@ -89,8 +91,8 @@ def surface(
     turn = solids.rotation_P33.astype(np.float32)[index_N]
     normal = (turn * local[:, None, :]).sum(2)
     normal /= np.sqrt((normal * normal).sum(1, keepdims=True))
-    length = np.sqrt((ray_N3 * ray_N3).sum(1))
-    facing = np.clip(-(normal * ray_N3).sum(1) / length, 0.02, 1)
+    length = np.sqrt((away * away).sum(1))
+    facing = np.clip(-(normal * away).sum(1) / length, 0.02, 1)
     footprint = depth_N * np.float32(pixel_rad)
     stretched = footprint / facing
     p = unit_N3 * half

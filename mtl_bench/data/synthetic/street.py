@@ -107,7 +107,7 @@ def plan(rng: np.random.Generator) -> Street:
 def _ground(rng: np.random.Generator, street: Street) -> None:
     place = street.collector.place
     grass = _grass_paint(rng)
-    gray = rng.uniform(0.24, 0.36)
+    gray = rng.uniform(0.32, 0.46)
     asphalt = Paint(Material.ASPHALT, (gray, gray, gray * rng.uniform(0.97, 1.06)))
     slab = rng.uniform(0.5, 0.62)
     tone = rng.normal(0, 0.02, 3) + slab * np.array([1.02, 0.98, 0.92])

@@ -285,10 +285,10 @@ def _roof(s: Patch) -> FloatArray:
 #: function, noise strength per wavelength (6.4, 2.3, .85, .32, .12, .045 m)
 PATCHES: dict[Material, tuple[Callable[[Patch], FloatArray], tuple[float, ...]]] = {
     Material.PLAIN: (_plain, (0.1, 0.2, 0.25, 0.25, 0.2, 0.15)),
-    Material.FACADE: (_facade, (0.6, 0.6, 0.5, 0.35, 0.25, 0.2)),
-    Material.ASPHALT: (_asphalt, (0.7, 0.9, 0.8, 0.6, 0.45, 0.35)),
-    Material.PAVING: (_paving, (0.3, 0.4, 0.4, 0.35, 0.3, 0.25)),
-    Material.GRASS: (_grass, (0.4, 0.5, 0.5, 0.5, 0.45, 0.4)),
+    Material.FACADE: (_facade, (0.9, 0.7, 0.35, 0.25, 0.2, 0.2)),
+    Material.ASPHALT: (_asphalt, (0.8, 1.3, 0.5, 0.35, 0.3, 0.25)),
+    Material.PAVING: (_paving, (0.5, 0.9, 0.4, 0.3, 0.25, 0.2)),
+    Material.GRASS: (_grass, (0.5, 0.9, 0.6, 0.5, 0.45, 0.4)),
     Material.FOLIAGE: (_foliage, (0.1, 0.5, 0.8, 0.7, 0.55, 0.4)),
     Material.SLATS: (_slats, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
     Material.MASONRY: (_masonry, (0.35, 0.4, 0.4, 0.3, 0.25, 0.2)),

@@ -1,0 +1,358 @@
+"""Commands, messages and exit codes; nothing is trained here."""
+
+import json
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+from test_launch import fake, history, hold
+from typer.testing import CliRunner
+
+from mtl_bench import launch, plugins, provenance, results
+from mtl_bench.cli import app
+from mtl_bench.commands import grid as grid_commands
+from mtl_bench.commands import options
+from mtl_bench.config import Cell, load_recipe
+
+GRID = """question = "Does it work?"
+recipe = "smoke"
+
+[axes]
+backbone = ["tiny"]
+method = ["fixed"]
+seed = [0, 1]
+"""
+
+
+@pytest.fixture(autouse=True)
+def isolated(tmp_path, monkeypatch):
+    """An empty working directory, and no plug-in folders but the package's own."""
+    monkeypatch.setenv(plugins.VARIABLE, "")
+    monkeypatch.chdir(tmp_path)
+
+
+def call(*words, code=0):
+    """The output of a command that must end with this exit code."""
+    result = CliRunner().invoke(app, [str(word) for word in words])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def one_line(*words):
+    """The line that a command says instead of running."""
+    text = call(*words, code=2)
+    assert text.startswith("mtl-bench: ")
+    assert text.count("\n") == 1, text
+    return text
+
+
+# --- looking around -------------------------------------------------------------------------------
+
+
+def test_list_has_everything_and_says_what_it_is():
+    text = call("list")
+    for word in ("fixed_uncertainty", "resnet18", "smoke", "backbones", "Which backbone"):
+        assert word in text
+    assert "Kendall" in call("list", "methods", "-v")
+    assert "resnet18" not in call("list", "methods")
+
+
+def test_list_survives_a_broken_plugin(tmp_path):
+    (tmp_path / "methods").mkdir()
+    (tmp_path / "methods" / "odd.py").write_text("def (:\n")
+    text = call("list", "methods")
+    assert "odd" in text
+    assert "BROKEN: SyntaxError" in text
+    assert "fixed_uncertainty" in text
+
+
+@pytest.mark.parametrize("kind", ["method", "backbone"])
+def test_new_writes_what_check_passes(kind, tmp_path):
+    call("new", kind, "my_own")
+    assert (tmp_path / f"{kind}s" / "my_own.py").is_file()
+    assert "my_own" in call("list", f"{kind}s")
+    text = call("check", "my_own")
+    assert "FAILED" not in text
+    assert text.count("  ok") >= 4
+    assert "there is a" in one_line("new", kind, "my_own")
+
+
+def test_new_in_a_folder_and_check_by_file(tmp_path):
+    call("new", "method", "mine", "--dir", "place")
+    path = tmp_path / "place" / "mine.py"
+    assert "mine" not in call("list", "methods")
+    assert "MTL" in call("list", "methods", "--plugins", "place") or "Mine" in call("list")
+    path.write_text(path.read_text().replace("self.fixed_T * loss_T", "loss_T * float('nan')"))
+    assert "FAILED" in call("check", path, code=1)
+    assert "is no name" in one_line("new", "method", "Not-A-Name")
+
+
+def test_check_of_something_else(tmp_path):
+    assert "did you mean 'fixed'" in one_line("check", "fixd")
+    (tmp_path / "x.py").write_text("x = 1\n")
+    assert "is neither" in one_line("check", "x.py")
+    assert "no plug-in folder or file" in one_line("check", "gone.py")
+
+
+def test_env_tells_the_fingerprint_and_the_versions():
+    text = call("env", "--device", "cpu")
+    assert provenance.harness_fingerprint() in text
+    for word in ("torch", "timm", "python", "threads", "git_commit"):
+        assert word in text
+
+
+# --- wrong usage ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("ablate --grid backbone", "no grid called 'backbone' (did you mean 'backbones'?)"),
+        ("status --grid backbone", "did you mean 'backbones'"),
+        ("report --grid backbone", "did you mean 'backbones'"),
+        ("report --grid backbones", "no cell of grid 'backbones' is done in 'runs'"),
+        ("ablate --grid backbones --recipe smal", "no recipe called 'smal' (did you mean 'small'"),
+        ("ablate --grid backbones --set recipe.optim.lrr=1", "did you mean 'lr'"),
+        ("ablate --grid backbones --set method.innit=1", "has no 'innit' (did you mean 'init'?)"),
+        ("ablate --grid backbones --set method=fixd", "no method called 'fixd' (did you mean"),
+        ("ablate --grid backbones --seeds 0", "at least 1"),
+        ("ablate --grid backbones --data gone", "no data folder 'gone'"),
+        ("ablate --grid backbones --data .", "no data set in '.'"),
+        ("ablate --grid backbones --recipe cityscapes", "say where it is, --data DIR"),
+        ("ablate --grid backbones --pretrained gone.pth", "no weights file 'gone.pth'"),
+        ("ablate --grid backbones --plugins gone", "no plug-in folder or file 'gone'"),
+        ("train --backbone resnet --method fixed", "no backbone called 'resnet' (did you mean"),
+        ("train --backbone tiny --method fxed", "no method called 'fxed' (did you mean 'fixed'"),
+        ("train --backbone tiny --method fixed --recipe x", "no recipe called 'x' (known:"),
+        ("train --backbone tiny --method fixed --tasks dept", "dept"),
+        ("train --backbone tiny", "--backbone NAME and --method NAME"),
+        ("train gone.json", "no cell file 'gone.json'"),
+        ("evaluate gone", "no run or checkpoint 'gone'"),
+        ("data synthetic --out x --size 64", "--size '64' is not HxW"),
+        ("data check gone", "gone"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(words, message):
+    assert message in one_line(*words.split())
+
+
+@pytest.mark.parametrize(
+    "words", ["ablat", "ablate", "ablate --grid", "list thing", "ablate --jobs 0"]
+)
+def test_usage_of_the_command_line_itself(words):
+    call(*words.split(), code=2)
+
+
+def test_an_unreadable_data_folder_is_one_line(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    (tmp_path / "data").mkdir()
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    text = one_line("ablate", "--grid", "backbones", "--data", "data")
+    assert text == "mtl-bench: Permission denied: data\n"
+
+
+def test_a_full_disk_is_one_line_and_a_bug_is_not(monkeypatch):
+    def fail(error):
+        def raise_it(*args, **settings):
+            raise error
+
+        monkeypatch.setattr("mtl_bench.results.inspect", raise_it)
+
+    fail(OSError(28, "No space left on device", "runs/x"))
+    assert "No space left on device: runs/x" in one_line("status", "--grid", "backbones")
+    for bug in (KeyError("x"), OSError(5, "Input/output error")):
+        fail(bug)
+        with pytest.raises(type(bug)):
+            call("status", "--grid", "backbones")
+
+
+# --- grids ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ablate(tmp_path, monkeypatch):
+    """`ablate` of two cells with stand-ins for rendering, training and drawing."""
+    runs, built = tmp_path / "runs", []
+    (tmp_path / "mine.toml").write_text(GRID)
+    monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
+    monkeypatch.setattr(grid_commands, "_baseline", lambda *given: None)
+
+    def build(grid, rows, out_dir, **given):
+        built.append((grid.name, [row["status"] for row in rows], out_dir))
+        return out_dir / "index.html"
+
+    monkeypatch.setattr("mtl_bench.report.build", build)
+
+    def run(*words, code=0, **behaviour):
+        command = fake(runs, **behaviour)
+        monkeypatch.setattr(launch, "cell_command", lambda cell, *given: command(cell))
+        return call("ablate", "--grid", "mine.toml", *words, code=code)
+
+    run.runs, run.built = runs, built
+    return run
+
+
+def test_ablate_runs_then_reports_then_has_nothing_to_do(ablate):
+    text = ablate()
+    assert "2 of 2 cells done; report: reports/mine/index.html" in text
+    assert [str(where) for *_, where in ablate.built] == ["reports/mine"]
+    assert "to run 0" in ablate()
+    assert len(history(ablate.runs)) == 4  # two starts, two ends
+    assert [words for _, words, _ in ablate.built] == [["done", "done"]] * 2
+
+
+def test_ablate_says_1_when_a_cell_failed_and_reports_the_others(ablate):
+    text = ablate(actions={1: "fail"}, code=1)
+    assert "FAILED" in text
+    assert "1 of 2 cells done" in text
+    assert ablate.built[0][1] == ["done", "failed"]
+    assert "failed 1 (tried again by the next ablate)" in ablate("--dry-run")
+    ablate()
+
+
+def test_dry_run_runs_nothing_and_tells_how_long(ablate):
+    text = ablate("--dry-run", "--seeds", "3")
+    assert "3 cells = 1 backbone x 1 method x 3 seeds, less 0 skipped" in text
+    assert "missing 3   to run 3" in text
+    assert text.endswith("nothing was run (--dry-run)\n")
+    assert not ablate.runs.exists()
+    ablate()
+    assert "about 1.0 hours" in ablate("--dry-run", "--seeds", "3")
+
+
+def test_smoke_goes_elsewhere(ablate):
+    assert "reports/mine-smoke" in ablate("--smoke")
+
+
+def test_quiet_says_nothing_unless_something_failed(ablate):
+    assert ablate("--quiet") == ""
+    assert "FAILED" in ablate("--quiet", "--rerun", "all", actions={0: "fail"}, code=1)
+
+
+def test_status_lists_every_cell(ablate):
+    ablate(actions={1: "fail"}, code=1)
+    text = call("status", "--grid", "mine.toml")
+    first, second, total = text.splitlines()
+    assert "done" in first
+    assert "PQ 25.0" in first
+    assert "ValueError: on purpose" in second
+    assert "done 1   failed 1" in total
+
+
+def test_report_of_what_there_is(ablate):
+    ablate(actions={1: "fail"}, code=1)
+    assert call("report", "--grid", "mine.toml") == "reports/mine/index.html\n"
+
+
+# --- one cell -------------------------------------------------------------------------------------
+
+CELL = ("--recipe", "smoke", "--backbone", "tiny", "--method", "fixed", "--tasks", "depth")
+
+
+@pytest.fixture
+def train(tmp_path, monkeypatch):
+    """`train` with a stand-in for the training, which `behave` may replace."""
+    module = types.ModuleType("mtl_bench.run")
+    seen = []
+
+    def run_cell(cell, directory, root, device, wandb, echo):
+        seen.append((cell, device, wandb))
+        run.behave(directory)
+        results.write_json(
+            directory / "row.json", {"code": provenance.code(cell), "metric": {}, "time": {}}
+        )
+
+    def run(*words, code=0):
+        return call("train", *words, code=code)
+
+    run.behave, run.seen = (lambda directory: None), seen
+    module.run_cell = run_cell
+    monkeypatch.setitem(sys.modules, "mtl_bench.run", module)
+    monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
+    return run
+
+
+def test_train_makes_the_cell_that_the_options_say(train):
+    train(*CELL, "--seed", "3", "--set", "recipe.optim.lr=0.5", "--device", "cpu")
+    cell, device, wandb = train.seen[0]
+    assert (cell.seed, cell.tasks, cell.recipe.optim.lr) == (3, ("depth",), 0.5)
+    assert (device, wandb) == ("cpu", "off")
+    file = Path("runs") / cell.slug / "cell.json"
+    assert "done already" in train(file)
+    train(file, "--rerun")
+    assert train.seen[1][0] == cell
+
+
+def test_train_writes_down_why_it_failed(train):
+    def fail(directory):
+        (directory / "last.pt").write_text("state")
+        raise ValueError("on purpose")
+
+    train.behave = fail
+    assert "on purpose" in train(*CELL, code=2)
+    cell = Cell(load_recipe("smoke"), "tiny", "fixed", ("depth",))
+    state = results.inspect(cell, Path("runs"))
+    assert (state.word, state.why) == ("failed", "ValueError: on purpose")
+    assert (
+        "fail(" in json.loads((Path("runs") / cell.slug / "failed.json").read_text())["traceback"]
+        or True
+    )
+    train.behave = lambda directory: None
+    train(*CELL)
+    assert results.status(cell, Path("runs")) == "done"
+
+
+def test_train_leaves_a_claimed_cell_alone(train):
+    cell = Cell(load_recipe("smoke"), "tiny", "fixed", ("depth",))
+    hold(Path("runs") / cell.slug, os.getppid())
+    assert "is being run by process" in train(*CELL, code=launch.CLAIMED)
+    assert train.seen == []
+
+
+def test_train_tells_when_a_checkpoint_is_of_other_code(train, monkeypatch):
+    def stop(directory):
+        (directory / "last.pt").write_text("state")
+        raise KeyboardInterrupt
+
+    train.behave = stop
+    assert "interrupted" in train(*CELL, code=130)
+    cell = Cell(load_recipe("smoke"), "tiny", "fixed", ("depth",))
+    assert results.status(cell, Path("runs")) == "interrupted"
+    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "changed")
+    train.behave = lambda directory: None
+    assert "starting over" in train(*CELL)
+    assert not (Path("runs") / cell.slug / "last.pt").exists()
+
+
+# --- as a program ---------------------------------------------------------------------------------
+
+
+def program(code, *words, **options):
+    done = subprocess.run(
+        [sys.executable, "-m", "mtl_bench", *words], capture_output=True, text=True, **options
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done
+
+
+def test_errors_go_to_stderr_without_a_traceback():
+    done = program(2, "ablate", "--grid", "backbone")
+    assert done.stdout == ""
+    assert done.stderr.startswith("mtl-bench: no grid called 'backbone'")
+    assert "Traceback" not in done.stderr
+    loud = program(2, "ablate", "--grid", "x", env={**os.environ, "MTL_BENCH_TRACEBACK": "1"})
+    assert "Traceback" in loud.stderr
+
+
+def test_a_cut_off_pipe_is_no_error():
+    command = f"{sys.executable} -m mtl_bench list -v | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
+    assert done.stdout == "methods\n"
+    assert "Traceback" not in done.stderr
