@@ -74,6 +74,7 @@ class Loss:
     small_weight: float = 3.0
     center_sigma: float = 8.0  # pixels
     scales: tuple[int, ...] = (0, 1, 2)  # depth outputs in the photometric loss, 0 = finest
+    levels: tuple[int, ...] = (0,)  # image pyramid levels compared: (0,) the paper's, k = 1/2^k size
     automask: bool = True  # unwarped frames among the minimum's candidates
     ssim_weight: float = 0.85
 

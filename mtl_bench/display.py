@@ -140,6 +140,8 @@ class Bars:
         self._progress.console.print(line, markup=False, highlight=False)
 
     def started(self, job: Running) -> None:
+        if job.cell.id in self._tasks:  # it was left to another process, and comes again
+            self._progress.remove_task(self._tasks[job.cell.id])
         self._tasks[job.cell.id] = self._progress.add_task(job.label, total=None, info="starting")
 
     def tick(self, jobs: Sequence[Running]) -> None:

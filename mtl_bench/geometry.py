@@ -65,7 +65,11 @@ def project(points_B3HW: Tensor, K_B33: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def warp(
-    image_B3HW: Tensor, depth_B1HW: Tensor, transform_B44: Tensor, K_B33: Tensor
+    image_B3HW: Tensor,
+    depth_B1HW: Tensor,
+    transform_B44: Tensor,
+    K_B33: Tensor,
+    padding: str = "zeros",
 ) -> tuple[Tensor, Tensor]:
     """Rebuild a target frame from another frame's image; also where it is in that frame's view.
 
@@ -74,9 +78,10 @@ def warp(
         depth_B1HW: the target frame's depth.
         transform_B44: takes points from the target's camera to the source's.
         K_B33: intrinsics of both.
+        padding: out of view, "zeros" (black) or "border" (the nearest pixel in view).
 
     Returns:
-        The warped image, bilinear and black out of view, and the mask [B,1,H,W] of valid
+        The warped image, bilinear, and the mask [B,1,H,W] of valid
         projections (the paper's M_v, which its public code does not have).
     """
     height, width = depth_B1HW.shape[-2:]
@@ -87,7 +92,7 @@ def warp(
     offset_B2HW, half_211, valid_B1HW = _divide(scaled_B3HW)
     # out of view is out of view: the bound keeps points near the camera plane from overflowing
     grid_BHW2 = (offset_B2HW / half_211).clamp(-4, 4).permute(0, 2, 3, 1)
-    warped = F.grid_sample(image_B3HW, grid_BHW2, padding_mode="zeros", align_corners=True)
+    warped = F.grid_sample(image_B3HW, grid_BHW2, padding_mode=padding, align_corners=True)
     return warped, valid_B1HW
 
 

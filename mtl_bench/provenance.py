@@ -23,6 +23,7 @@ HARNESS = (  # what numbers depend on; the rest launches, stores or shows
     "backward.py",
     "engine.py",
     "geometry.py",
+    "depth_scale.py",
     "postprocess.py",
     "train.py",
     "evaluate.py",

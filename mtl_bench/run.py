@@ -138,13 +138,12 @@ def time_cell(model: Model, cell: Cell, root: Path, engine: Engine) -> dict[str,
 def headline(metrics: dict[str, Any]) -> str:
     """The two or three numbers that a person wants first."""
     parts = {
-        "PQ": ("panoptic.pq", 100),
-        "mIoU": ("semantic.miou", 100),
-        "RMSE": ("depth_median.rmse", 1),
-        "AbsRel": ("depth_median.abs_rel", 1),
+        "PQ": "panoptic.pq",
+        "mIoU": "semantic.miou",
+        "RMSE": "depth_median.rmse",
+        "AbsRel": "depth_median.abs_rel",
     }
-    found = [(name, metrics[key] * by) for name, (key, by) in parts.items() if key in metrics]
-    return ", ".join(f"{name} {value:.3g}" for name, value in found)
+    return ", ".join(f"{n} {metrics[key]:.3g}" for n, key in parts.items() if key in metrics)
 
 
 def _save_samples(path: Path, samples: dict[str, Any]) -> None:

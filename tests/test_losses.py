@@ -196,9 +196,9 @@ def test_photometric_loss_equals_a_slow_one() -> None:
             scene.target,
             scene.context,
             scales,
-            scene.transforms,
             scene.K,
             scene.mask,
+            scene.transforms,
             automask=automask,
         )
         assert loss.item() == pytest.approx(expected[automask], abs=1e-12)
@@ -261,7 +261,7 @@ def test_a_tie_goes_to_the_unwarped_frame() -> None:
     mask, one = torch.ones(1, 9, 17, dtype=torch.bool), torch.ones(1, 1, 9, 17)
     still, K = torch.eye(4).repeat(1, 1, 1, 1).requires_grad_(), torch.eye(3)[None]
     for automask in (True, False):
-        loss = photometric_loss(target, context, [one], still, K, mask, automask=automask)
+        loss = photometric_loss(target, context, [one], K, mask, still, automask=automask)
         (grad,) = torch.autograd.grad(loss, still)
         assert bool((grad == 0).all()) == automask
 

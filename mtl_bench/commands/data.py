@@ -25,7 +25,7 @@ def synthetic(
     size: Annotated[str, typer.Option(metavar="HxW", help="Pixels.")] = "64x128",
     scenes: Annotated[int, typer.Option(metavar="N", help="In the training split.")] = 800,
     val_scenes: Annotated[int, typer.Option(metavar="N", help="In the validation split.")] = 100,
-    test_scenes: Annotated[int, typer.Option(metavar="N", help="In the test split.")] = 0,
+    test_scenes: Annotated[int, typer.Option(metavar="N", help="In the test split.")] = 8,
     seed: Annotated[int, typer.Option(help="Which world.")] = 0,
     frames: Annotated[int, typer.Option(help="Of each scene's video, odd; 30 as Cityscapes.")] = 3,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,

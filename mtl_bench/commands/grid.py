@@ -73,6 +73,8 @@ def ablate(
     chosen = _load(grid, recipe, seeds, smoke, settings, pretrained)
     check_cells(chosen.cells)
     todo = launch.to_run(chosen.cells, runs, rerun)
+    for cell in [] if dry_run else todo:
+        o.locate(cell, data)  # a wrong folder is told at once
     if not quiet or dry_run:
         _announce(chosen, todo, runs)
     if dry_run:
@@ -81,7 +83,7 @@ def ablate(
     options = ["--device", device.value, "--wandb", wandb.value]
     if todo:
         _run(todo, runs, data, options, jobs, rerun, quiet)
-    _baseline(chosen, data, runs, quiet)
+    _baseline(chosen, data, runs, quiet, refresh=bool(todo))
     page = _write(chosen, runs, reports)
     words = [row["status"] for row in _rows(chosen, runs)]
     bad = sum(word not in ("done", "stale") for word in words)
@@ -226,12 +228,17 @@ def _write(grid: "Grid", runs: Path, reports: Path) -> Path:
     )
 
 
-def _baseline(grid: "Grid", data: Path | None, runs: Path, quiet: bool) -> None:
-    """Measure the trivial predictors once for the grid's data set; a table shows them."""
+def _baseline(
+    grid: "Grid", data: Path | None, runs: Path, quiet: bool, refresh: bool = False
+) -> None:
+    """Measure the trivial predictors on the grid's data set (`baselines` keeps what it did once).
+
+    Not refreshed when no cell ran: then the numbers beside them are the old ones, too.
+    """
     from mtl_bench import results
 
     file = _baseline_file(grid, runs)
-    if file is None or file.is_file():
+    if file is None or (file.is_file() and not refresh):
         return
     from mtl_bench.baselines import baselines
 

@@ -138,8 +138,8 @@ def weights(pretrained: str | None) -> str | None:
     return str(path)
 
 
-def data_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:
-    """Where a cell's images are; the built-in ones are rendered when they are missing.
+def locate(cell: Cell, data: Path | None) -> Path | None:
+    """Where a cell's images are; None for the built-in ones. Renders nothing.
 
     Raises:
         ValueError: no data set there, or a recipe for a data set that only `--data` can find.
@@ -157,9 +157,21 @@ def data_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:
         raise ValueError(
             f"recipe '{cell.recipe.name}' trains on {name}: say where it is, --data DIR"
         )
-    from mtl_bench.data import synthetic
+    return None
 
-    return synthetic.ensure(cell.recipe.data, progress=not quiet)
+
+def data_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:
+    """Where a cell's images are; the built-in ones are rendered when they are missing.
+
+    Raises:
+        ValueError: as `locate`.
+    """
+    root = locate(cell, data)
+    if root is None:
+        from mtl_bench.data import synthetic
+
+        root = synthetic.ensure(cell.recipe.data, progress=not quiet)
+    return root
 
 
 def columns(lines: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:

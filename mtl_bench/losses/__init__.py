@@ -11,7 +11,7 @@ from torch import Tensor
 from mtl_bench import config
 from mtl_bench.data.batch import Batch
 from mtl_bench.losses.instance import center_loss, offset_loss
-from mtl_bench.losses.photometric import photometric_loss
+from mtl_bench.losses.photometric import View, photometric_loss
 from mtl_bench.losses.semantic import semantic_loss
 from mtl_bench.losses.smoothness import smoothness_loss
 from mtl_bench.losses.terms import TERMS, Term, terms_of
@@ -71,20 +71,27 @@ def _depth(
             f"{list(range(available))}: name one or more of those"
         )
     inverse_SB1HW = [_full(outputs.inverse_depth[scale]) for scale in loss.scales]
-    image_B3HW, mask_BHW = _full(batch.clean_B3HW), batch.reprojection_mask_BHW
+    mask_BHW = batch.reprojection_mask_BHW
     assert mask_BHW is not None
-    return {
-        "photometric": photometric_loss(
-            image_B3HW,
-            _full(batch.clean_context_BN3HW),
-            inverse_SB1HW,
+    view = View(
+        _full(batch.clean_B3HW),
+        _full(batch.clean_context_BN3HW),
+        inverse_SB1HW,
+        _full(batch.K_B33),
+        mask_BHW,
+    )
+    errors = [
+        photometric_loss(
+            *view.at_level(level),
             _full(transforms_BN44),
-            _full(batch.K_B33),
-            mask_BHW,
             ssim_weight=loss.ssim_weight,
             automask=loss.automask,
-        ),
-        "smoothness": smoothness_loss(inverse_SB1HW, loss.scales, image_B3HW, mask_BHW),
+        )
+        for level in loss.levels
+    ]
+    return {
+        "photometric": torch.stack(errors).mean(),
+        "smoothness": smoothness_loss(inverse_SB1HW, loss.scales, view.target_B3HW, mask_BHW),
     }
 
 

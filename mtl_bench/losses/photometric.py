@@ -5,21 +5,54 @@ colour jitter.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from mtl_bench import geometry
 from mtl_bench.losses.ssim import PhotometricError
 
 
+class View(NamedTuple):
+    """What a frame and its neighbours show, and from where."""
+
+    target_B3HW: Tensor
+    context_BN3HW: Tensor
+    inverse_SB1HW: Sequence[Tensor]  # one inverse depth a scale, all at full resolution
+    K_B33: Tensor
+    mask_BHW: Tensor  # bool, False on sky, ego vehicle and padding
+
+    def at_level(self, level: int) -> "View":
+        """The same view in images of 1/2^level the size, each pixel the mean of those it replaces.
+
+        A gradient reaches no further than the pixels next to a projection. In a small image these
+        are far apart, so that depth and pose find their way from a start that is many pixels off.
+        """
+        if level == 0:
+            return self
+        factor = 2**level
+
+        def shrink(x: Tensor) -> Tensor:
+            return F.avg_pool2d(x.flatten(0, -4), factor).unflatten(0, x.shape[:-3])
+
+        return View(
+            shrink(self.target_B3HW),
+            shrink(self.context_BN3HW),
+            [shrink(inverse_B1HW) for inverse_B1HW in self.inverse_SB1HW],
+            geometry.scale_intrinsics(self.K_B33, 1 / factor, 1 / factor),
+            shrink(self.mask_BHW.float().unsqueeze(1)).squeeze(1) > 0.5,
+        )
+
+
 def photometric_loss(
     target_B3HW: Tensor,
     context_BN3HW: Tensor,
     inverse_SB1HW: Sequence[Tensor],
-    transforms_BN44: Tensor,
     K_B33: Tensor,
     mask_BHW: Tensor,
+    transforms_BN44: Tensor,
     *,
     ssim_weight: float = 0.85,
     automask: bool = True,
@@ -33,6 +66,8 @@ def photometric_loss(
       candidate for the minimum; a pixel that no warped frame shows is left out of the mean.
     - `automask` puts the unwarped frames among the candidates. A tie goes to them: such a pixel
       pulls on nothing. No noise breaks ties, so that the loss is a function of its inputs.
+    - Out of view, the border's pixels stand in: black ones would reach into the view through SSIM's
+      window and push the depth of the image's edge away.
     - The mean over scales, where the paper writes a sum (its public code: the mean).
 
     Args:
@@ -52,7 +87,9 @@ def photometric_loss(
         errors, valids = [], []
         # one image at a time: on a CPU this is faster than one big call, as the cache holds it
         for frame_B3HW, transform_B44 in zip(contexts, transforms_BN44.unbind(1), strict=True):
-            warped_B3HW, valid_B1HW = geometry.warp(frame_B3HW, depth_B1HW, transform_B44, K_B33)
+            warped_B3HW, valid_B1HW = geometry.warp(
+                frame_B3HW, depth_B1HW, transform_B44, K_B33, padding="border"
+            )
             valids.append(valid_B1HW.squeeze(1))
             errors.append(error_of(warped_B3HW).masked_fill(~valids[-1], torch.inf))
         error_BHW = torch.stack(errors).amin(0)

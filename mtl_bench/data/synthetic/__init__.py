@@ -32,7 +32,9 @@ def ensure(data: Data, root: Path | None = None, progress: bool = True) -> Path:
     Returns:
         The data set's folder, laid out like Cityscapes'.
     """
-    settings = _settings(data.height, data.width, data.train_scenes, data.val_scenes, 8, data.seed, 3, 1, None)
+    settings = _settings(
+        data.height, data.width, data.train_scenes, data.val_scenes, 8, data.seed, 3, 1, None
+    )
     root = platformdirs.user_cache_path("mtl-bench") if root is None else Path(root)
     out = root / f"synthetic-{data.height}x{data.width}-{settings.key}"
     if not out.is_dir():
@@ -75,7 +77,15 @@ def write(
     if annotated is None:
         annotated = 19 if frames == 30 else frames // 2
     settings = _settings(
-        height, width, train_scenes, val_scenes, test_scenes, seed, frames, annotated, min_instance_area
+        height,
+        width,
+        train_scenes,
+        val_scenes,
+        test_scenes,
+        seed,
+        frames,
+        annotated,
+        min_instance_area,
     )
     out = Path(out)
     with _lock(out):
@@ -112,7 +122,9 @@ def _lock(out: Path) -> Iterator[None]:
     out.parent.mkdir(parents=True, exist_ok=True)
     try:
         import fcntl
-    except ImportError:  # Windows: two processes that render the same set at once fail on the rename
+    except (
+        ImportError
+    ):  # Windows: two processes that render the same set at once fail on the rename
         yield
         return
     path = out.with_name(f"{out.name}.lock")

@@ -6,13 +6,16 @@ is the depth z itself. At the annotated frame the camera stands at x = 0, z = 0.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float32]
+FloatArray = NDArray[np.floating[Any]]  # float32 wherever there is one value a ray
 DoubleArray = NDArray[np.float64]
-BASELINE_M = 0.22  # as in Cityscapes; half a disparity step is < 2 % of the depth at 80 m from 32x64 on
+BASELINE_M = (
+    0.22  # as in Cityscapes; half a disparity step is < 2 % of the depth at 80 m from 32x64 on
+)
 FRAMES_PER_S = 17.0
 
 
@@ -74,13 +77,15 @@ def draw_camera(rng: np.random.Generator, height: int, width: int) -> Camera:
 
 
 def draw_motion(rng: np.random.Generator, camera: Camera, frames: int, annotated: int) -> Motion:
-    """Drive forward with nearly constant speed and turn rate; the suspension adds a little pitch."""
-    step_m, yaw_step = rng.uniform(0.35, 0.8), rng.normal(0, 0.0025)
+    """Drive forward with nearly constant speed and turn rate; suspension adds some pitch."""
+    step_m, yaw_step = rng.uniform(0.45, 0.8), rng.normal(0, 0.0025)
     heading, base_pitch = rng.normal(0, 0.015), rng.normal(0.012, 0.008)
     steps_m = step_m * (1 + rng.normal(0, 0.02, frames))
     yaws = heading + yaw_step * (np.arange(frames) - annotated) + rng.normal(0, 0.0004, frames)
     pitches = base_pitch + rng.normal(0, 0.0008, frames)
-    along = np.cumsum(np.stack([np.sin(yaws), np.zeros(frames), np.cos(yaws)], 1) * steps_m[:, None], 0)
+    along = np.cumsum(
+        np.stack([np.sin(yaws), np.zeros(frames), np.cos(yaws)], 1) * steps_m[:, None], 0
+    )
     places = along - along[annotated] - [0, camera.mount_m, 0]
     poses = (Pose(places[i], rotation(yaws[i], pitches[i])) for i in range(frames))
     return Motion(step_m, yaw_step, tuple(poses), float(pitches[annotated]))

@@ -73,7 +73,9 @@ def _pairs(solids: NDArray, r0: NDArray, c0: NDArray, wide: NDArray, area: NDArr
     return solids[which], row + r0[which], col + c0[which]
 
 
-def _nearest(depth: FloatArray, index: NDArray, solid: NDArray, ray: NDArray, t: FloatArray) -> None:
+def _nearest(
+    depth: FloatArray, index: NDArray, solid: NDArray, ray: NDArray, t: FloatArray
+) -> None:
     """Put the nearest of several hits of a ray into the flat views of depth and index."""
     flat_depth, flat_index = depth.reshape(-1), index.reshape(-1)
     better = np.flatnonzero(t < flat_depth[ray])

@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 
 from mtl_bench.data.labels import CITYSCAPES19
 from mtl_bench.data.synthetic import render
-from mtl_bench.data.synthetic.camera import BASELINE_M, FRAMES_PER_S, FloatArray, context_from_target
+from mtl_bench.data.synthetic.camera import (
+    BASELINE_M,
+    FRAMES_PER_S,
+    FloatArray,
+    context_from_target,
+)
 
 SPLITS = ("train", "val", "test")
 _CITY_SCENES = 50
@@ -27,7 +32,13 @@ _SUPERCATEGORIES = (
     "nature", "nature", "sky", "human", "human", *["vehicle"] * 6,
 )  # fmt: skip
 _CATEGORIES = [
-    {"id": x.label_id, "name": x.name, "color": x.color, "supercategory": s, "isthing": int(x.is_thing)}
+    {
+        "id": x.label_id,
+        "name": x.name,
+        "color": x.color,
+        "supercategory": s,
+        "isthing": int(x.is_thing),
+    }
     for x, s in zip(CITYSCAPES19.labels, _SUPERCATEGORIES, strict=True)
 ]
 _EVALUATED = {label.label_id: label for label in CITYSCAPES19.labels}
@@ -51,11 +62,15 @@ class Settings:
     def __post_init__(self) -> None:
         """Raises: ValueError: sizes or counts that cannot be rendered."""
         if self.height < 16 or self.width < 16:
-            raise ValueError(f"{self.height}x{self.width} is too small to render; use 16x16 or more")
+            raise ValueError(
+                f"{self.height}x{self.width} is too small to render; use 16x16 or more"
+            )
         if not 0 <= self.annotated < self.frames:
             raise ValueError(f"annotated frame {self.annotated} is not among {self.frames} frames")
         if min(self.counts) < 0 or sum(self.counts) == 0:
-            raise ValueError(f"cannot render {self.counts} scenes; give counts >= 0, one of them > 0")
+            raise ValueError(
+                f"cannot render {self.counts} scenes; give counts >= 0, one of them > 0"
+            )
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -77,7 +92,9 @@ class Settings:
         return city, f"{city}_{scene % _CITY_SCENES:06d}"
 
 
-def encode_disparity(depth_m: FloatArray, fx: float, baseline_m: float = BASELINE_M) -> NDArray[np.uint16]:
+def encode_disparity(
+    depth_m: FloatArray, fx: float, baseline_m: float = BASELINE_M
+) -> NDArray[np.uint16]:
     """Cityscapes' uint16 disparity of a depth map: round(256 d) + 1 with d = baseline fx / depth.
 
     0 = invalid: no depth, or a disparity that 16 bits cannot hold.
@@ -90,7 +107,11 @@ def encode_disparity(depth_m: FloatArray, fx: float, baseline_m: float = BASELIN
 def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict[str, Any]:
     """Render and write one scene; returns its entries of the split's panoptic JSON."""
     scene = render.draw_scene(
-        (settings.seed, split, number), settings.height, settings.width, settings.frames, settings.annotated
+        (settings.seed, split, number),
+        settings.height,
+        settings.width,
+        settings.frames,
+        settings.annotated,
     )
     name = SPLITS[split]
     city, stem = settings.place(split, number)
@@ -112,7 +133,11 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
     _write_png(path("gtFine", target, "gtFine_labelIds.png"), seen.label_HW)
     disparity = encode_disparity(seen.depth_HW, scene.camera.fx)
     _write_png(path("disparity", target, "disparity.png"), disparity)
-    for kind, values in (("camera", _camera(scene)), ("vehicle", _vehicle(scene)), ("egomotion", _egomotion(scene))):
+    for kind, values in (
+        ("camera", _camera(scene)),
+        ("vehicle", _vehicle(scene)),
+        ("egomotion", _egomotion(scene)),
+    ):
         text = json.dumps(values, indent=4, sort_keys=True)
         path(kind, target, f"{kind}.json").write_text(text + "\n")
     image_id = f"{stem}_{target:06d}"
@@ -139,8 +164,17 @@ def panoptic(ids_HW: NDArray[np.uint16], image_id: str) -> tuple[NDArray[np.uint
         segments.append({"id": number, "category_id": label.label_id, "area": int(mask.sum()),
                          "bbox": box, "iscrowd": int(group and label.is_thing)})  # fmt: skip
     height, width = ids_HW.shape
-    entry = {"id": image_id, "width": width, "height": height, "file_name": f"{image_id}_gtFine_leftImg8bit.png"}
-    annotation = {"image_id": image_id, "file_name": f"{image_id}_gtFine_panoptic.png", "segments_info": segments}
+    entry = {
+        "id": image_id,
+        "width": width,
+        "height": height,
+        "file_name": f"{image_id}_gtFine_leftImg8bit.png",
+    }
+    annotation = {
+        "image_id": image_id,
+        "file_name": f"{image_id}_gtFine_panoptic.png",
+        "segments_info": segments,
+    }
     return picture, {"image": entry, "annotation": annotation}
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from mtl_bench.data.synthetic.material import Material
 from mtl_bench.data.synthetic.primitives import Paint, Part, Point, ball, box, rod
-from mtl_bench.data.synthetic.texture import Material
 
 ROAD, SIDEWALK, BUILDING, WALL, FENCE = 7, 8, 11, 12, 13
 POLE, LIGHT, SIGN, VEGETATION, TERRAIN = 17, 19, 20, 21, 22
@@ -15,7 +15,9 @@ _METAL = ((0.42, 0.44, 0.45), (0.3, 0.32, 0.32), (0.55, 0.56, 0.56), (0.2, 0.25,
 
 
 def _vary(rng: np.random.Generator, color: Point, spread: float = 0.05) -> Point:
-    r, g, b = np.clip(np.array(color) * rng.normal(1, spread) + rng.normal(0, spread / 2, 3), 0.03, 0.95)
+    r, g, b = np.clip(
+        np.array(color) * rng.normal(1, spread) + rng.normal(0, spread / 2, 3), 0.03, 0.95
+    )
     return float(r), float(g), float(b)
 
 
@@ -24,11 +26,20 @@ def building(rng: np.random.Generator, size: Point, pitched: bool) -> list[Part]
     w, h, length = size
     color = _vary(rng, _PLASTER[rng.integers(len(_PLASTER))], 0.08)
     ground = _vary(rng, _PLASTER[rng.integers(len(_PLASTER))]) if rng.random() < 0.5 else color
-    params = (rng.uniform(2.9, 3.5), rng.uniform(2.0, 3.4), rng.uniform(0.38, 0.58), rng.uniform(0.42, 0.58))
+    params = (
+        rng.uniform(2.9, 3.5),
+        rng.uniform(2.0, 3.4),
+        rng.uniform(0.38, 0.58),
+        rng.uniform(0.42, 0.58),
+    )
     parts = [box((0, 0, 0), size, Paint(Material.FACADE, color, ground, params), BUILDING)]
     if pitched:
-        tiles = Paint(Material.ROOF, _vary(rng, ((0.5, 0.22, 0.16), (0.3, 0.27, 0.27))[rng.integers(2)]))
-        parts.append(box((0, h, 0), (w + 0.5, min(w, 9) * 0.42, length + 0.3), tiles, BUILDING, (0.96, 0, 0)))
+        tiles = Paint(
+            Material.ROOF, _vary(rng, ((0.5, 0.22, 0.16), (0.3, 0.27, 0.27))[rng.integers(2)])
+        )
+        parts.append(
+            box((0, h, 0), (w + 0.5, min(w, 9) * 0.42, length + 0.3), tiles, BUILDING, (0.96, 0, 0))
+        )
     return parts
 
 
@@ -42,7 +53,12 @@ def tree(rng: np.random.Generator, height: float) -> list[Part]:
     v = VEGETATION
     parts = [
         rod((0, 0, 0), (0, fork + 0.3, 0), height * 0.027, bark, v),
-        ball((0, fork + 0.52 * (height - fork), 0), (crown * 0.8, (height - fork) * 0.85, crown * 0.8), leaves, v),
+        ball(
+            (0, fork + 0.52 * (height - fork), 0),
+            (crown * 0.8, (height - fork) * 0.85, crown * 0.8),
+            leaves,
+            v,
+        ),
     ]
     count = int(rng.integers(7, 10))
     for i in range(count):
@@ -50,7 +66,11 @@ def tree(rng: np.random.Generator, height: float) -> list[Part]:
         level = (i + 0.5) / count
         reach = crown * (0.34 - 0.18 * level) * rng.uniform(0.8, 1.2)
         size = crown * rng.uniform(0.36, 0.52)
-        at = (reach * np.cos(angle), fork + (0.18 + 0.74 * level) * (height - fork), reach * np.sin(angle))
+        at = (
+            reach * np.cos(angle),
+            fork + (0.18 + 0.74 * level) * (height - fork),
+            reach * np.sin(angle),
+        )
         parts.append(ball(at, (size, size * 0.82, size), leaves, v))
         if i < 3:
             parts.append(rod((0, fork * 0.95, 0), at, height * 0.012, bark, v))
@@ -72,19 +92,25 @@ def hedge(rng: np.random.Generator, length: float) -> list[Part]:
     """A clipped hedge along z."""
     green = _vary(rng, (0.2, 0.36, 0.11), 0.1)
     leaves = Paint(Material.FOLIAGE, green, tuple(0.35 * c for c in green))
-    return [box((0, 0, 0), (0.9, rng.uniform(1.0, 2.2), length), leaves, VEGETATION, (0.12, 0.02, 0.02))]
+    return [
+        box((0, 0, 0), (0.9, rng.uniform(1.0, 2.2), length), leaves, VEGETATION, (0.12, 0.02, 0.02))
+    ]
 
 
 def wall(rng: np.random.Generator, length: float) -> list[Part]:
     """A garden or retaining wall along z: masonry or bare concrete under a coping."""
     color = _vary(rng, ((0.58, 0.57, 0.54), (0.56, 0.36, 0.28), (0.66, 0.6, 0.5))[rng.integers(3)])
-    paint = Paint(Material.MASONRY, color, tuple(0.72 * c for c in color), (rng.uniform(0.2, 0.5), 0, 0, 0))
+    paint = Paint(
+        Material.MASONRY, color, tuple(0.72 * c for c in color), (rng.uniform(0.2, 0.5), 0, 0, 0)
+    )
     return [box((0, 0, 0), (0.35, rng.uniform(1.2, 2.4), length), paint, WALL)]
 
 
 def fence(rng: np.random.Generator, length: float) -> list[Part]:
     """Pales, planks or bars along z, with the dark of what lies behind in the gaps."""
-    color = ((0.72, 0.7, 0.66), (0.46, 0.32, 0.2), (0.2, 0.28, 0.22), (0.5, 0.53, 0.55))[rng.integers(4)]
+    color = ((0.72, 0.7, 0.66), (0.46, 0.32, 0.2), (0.2, 0.28, 0.22), (0.5, 0.53, 0.55))[
+        rng.integers(4)
+    ]
     color = _vary(rng, color)
     gap = tuple(0.28 * c + 0.03 for c in color)
     params = (rng.uniform(0.16, 0.42), rng.uniform(0.4, 0.62), float(rng.random() < 0.25), 0.0)
@@ -118,7 +144,9 @@ def lamp_post(rng: np.random.Generator, reach: float) -> list[Part]:
 def traffic_light(rng: np.random.Generator, reach: float) -> list[Part]:
     """Signal heads facing -z on a pole; with |reach| > 0 another one over the road."""
     metal = Paint(Material.PLAIN, _vary(rng, _METAL[rng.integers(3)]))
-    head = Paint(Material.LAMPS, (0.07, 0.08, 0.07), params=(float(rng.choice([0, 2, 2, 1])), 0, 0, 0))
+    head = Paint(
+        Material.LAMPS, (0.07, 0.08, 0.07), params=(float(rng.choice([0, 2, 2, 1])), 0, 0, 0)
+    )
     height, k = rng.uniform(2.1, 2.6), rng.uniform(1.1, 1.5)
     size = (0.36 * k, 1.0 * k, 0.3 * k)
     parts = [

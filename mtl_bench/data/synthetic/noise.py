@@ -36,14 +36,13 @@ def lattice_noise(points_N3: FloatArray) -> FloatArray:
     return c[:, 0] + (c[:, 1] - c[:, 0]) * f[:, 2]
 
 
-def fractal_noise(points_N3: FloatArray, amplitude_NK: FloatArray, footprint_N: FloatArray) -> FloatArray:
-    """Sum of octaves [N]; an octave fades out while its wavelength shrinks from 16 to 2 pixels.
-
-    That slowly, because a surface that comes nearer must not change its look from frame to frame.
-    """
+def fractal_noise(
+    points_N3: FloatArray, amplitude_NK: FloatArray, footprint_N: FloatArray
+) -> FloatArray:
+    """Sum of octaves [N]; an octave fades out while its wavelength shrinks from 9 to 3 pixels."""
     total = np.zeros(len(points_N3), np.float32)
     for k, wavelength in enumerate(WAVELENGTHS_M):
-        weight = amplitude_NK[:, k] * np.clip(np.log2(wavelength / (2 * footprint_N)) / 3, 0, 1)
+        weight = amplitude_NK[:, k] * np.clip(np.log2(wavelength / (3 * footprint_N)) / 1.6, 0, 1)
         seen = np.flatnonzero(weight)
         if len(seen):
             shifted = points_N3[seen] * np.float32(1 / wavelength) + np.float32(7.31 * k)
@@ -62,10 +61,17 @@ def pulses(x: FloatArray, duty: FloatArray | float, width: FloatArray) -> FloatA
     return (area(x + width / 2) - area(x - width / 2)) / width
 
 
-def band(x: FloatArray, low: FloatArray | float, high: FloatArray | float, width: FloatArray) -> FloatArray:
-    """Coverage of the interval [low, high] seen through a box of `width`."""
-    width = np.maximum(width, 1e-4)
-    return np.clip((x - low) / width + 0.5, 0, 1) - np.clip((x - high) / width + 0.5, 0, 1)
+def band(
+    x: FloatArray, low: FloatArray | float, high: FloatArray | float, width: FloatArray
+) -> FloatArray:
+    """Coverage of the interval [low, high] with edges that rise smoothly over 1.8 `width`."""
+    width = np.maximum(1.8 * width, 1e-4)
+
+    def edge(t: FloatArray) -> FloatArray:
+        t = np.clip(t + 0.5, 0, 1)
+        return t * t * (3 - 2 * t)
+
+    return edge((x - low) / width) - edge((x - high) / width)
 
 
 def mix(a: FloatArray, b: FloatArray, share_N: FloatArray) -> FloatArray:

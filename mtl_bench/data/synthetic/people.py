@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mtl_bench.data.synthetic.material import Material
 from mtl_bench.data.synthetic.primitives import Paint, Part, ball, box, rod
-from mtl_bench.data.synthetic.texture import Material
 
 PERSON, RIDER = 24, 25
 _SKIN = ((0.85, 0.66, 0.54), (0.72, 0.5, 0.38), (0.45, 0.3, 0.22), (0.9, 0.74, 0.64))
@@ -47,17 +47,27 @@ def person(rng: np.random.Generator) -> list[Part]:
     parts = [
         ball((0, 1.62 * k, 0.02), (0.2 * k, 0.27 * k, 0.23 * k), wear.head, n),
         rod((0, 1.4 * k, 0), (0, 1.56 * k, 0.01), 0.06 * k, wear.skin, n),
-        box((0, hip - 0.06, 0), (0.46 * k, shoulder - hip + 0.1, 0.26 * k), wear.top, n, (0.12, 0.1, 0.1)),
+        box(
+            (0, hip - 0.06, 0),
+            (0.46 * k, shoulder - hip + 0.1, 0.26 * k),
+            wear.top,
+            n,
+            (0.12, 0.1, 0.1),
+        ),
     ]
     for side in (-1, 1):
         x, z = side * 0.1 * k, side * stride
         parts.append(rod((x, hip, 0), (x, 0.06, z), 0.085 * k, wear.legs, n))
         parts.append(ball((x, 0.05, z + 0.06), (0.1, 0.1, 0.26), wear.shoes, n))
         a = side * 0.26 * k
-        parts.append(rod((a, shoulder - 0.04, 0), (a * 1.1, hip - 0.02, -z * 0.7), 0.055 * k, wear.top, n))
+        parts.append(
+            rod((a, shoulder - 0.04, 0), (a * 1.1, hip - 0.02, -z * 0.7), 0.055 * k, wear.top, n)
+        )
         parts.append(ball((a * 1.1, hip - 0.05, -z * 0.75), (0.09, 0.11, 0.09), wear.skin, n))
     if rng.random() < 0.2:
-        parts.append(box((0, 0.5 * k, 0), (0.5 * k, 0.45 * k, 0.4 * k), wear.top, n, (0.3, 0.3, 0.3)))
+        parts.append(
+            box((0, 0.5 * k, 0), (0.5 * k, 0.45 * k, 0.4 * k), wear.top, n, (0.3, 0.3, 0.3))
+        )
     if rng.random() < 0.3:
         bag = Paint(Material.PLAIN, _TOPS[rng.integers(len(_TOPS))])
         parts.append(box((0, 1.0 * k, -0.2 * k), (0.3 * k, 0.42 * k, 0.18 * k), bag, n))
@@ -91,6 +101,8 @@ def rider(
         foot = (side * foot_x, feet[0] + lift, feet[1])
         parts.append(rod((side * 0.1, seat[0], seat[1]), knee, 0.09, wear.legs, n))
         parts.append(rod(knee, foot, 0.07, wear.legs, n))
-        parts.append(ball((foot[0], foot[1] - 0.03, foot[2] + 0.06), (0.1, 0.1, 0.26), wear.shoes, n))
+        parts.append(
+            ball((foot[0], foot[1] - 0.03, foot[2] + 0.06), (0.1, 0.1, 0.26), wear.shoes, n)
+        )
         parts.append(rod((side * 0.21, neck[0], neck[1]), (side * 0.27, *hands), 0.06, wear.top, n))
     return parts

@@ -20,12 +20,12 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a) if bin(a ^ b).coun
 
 
 class Paint(NamedTuple):
-    """What a surface looks like; `material` is one of `texture.Material`."""
+    """What a surface looks like; `material` is one of `material.Material`."""
 
     material: int
-    color: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    color2: tuple[float, float, float] = (0.5, 0.5, 0.5)
-    params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    color: tuple[float, ...] = (0.5, 0.5, 0.5)
+    color2: tuple[float, ...] = (0.5, 0.5, 0.5)
+    params: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
 
 
 class Part(NamedTuple):
@@ -113,7 +113,13 @@ class Collector:
             local = np.eye(3) if part.rotation is None else part.rotation
             center = turn @ part.center + [x, -base_m, z]
             self.rows.append(
-                (part, center, turn @ local, (velocity[0], 0.0, velocity[1]), numbers.get(part.label, 0))
+                (
+                    part,
+                    center,
+                    turn @ local,
+                    (velocity[0], 0.0, velocity[1]),
+                    numbers.get(part.label, 0),
+                )
             )
 
     def solids(self) -> Solids:
@@ -147,13 +153,17 @@ def unit_frames(solids: Solids, pose: Pose, time: int) -> tuple[FloatArray, Floa
     return direction.astype(np.float32), origin.astype(np.float32)
 
 
-def screen_bounds(solids: Solids, pose: Pose, camera: Camera, time: int) -> tuple[FloatArray, FloatArray]:
-    """Per solid [P,4] the image box u_min, u_max, v_min, v_max in pixels, and [P] its nearest depth.
+def screen_bounds(
+    solids: Solids, pose: Pose, camera: Camera, time: int
+) -> tuple[FloatArray, FloatArray]:
+    """Per solid [P,4] the image box (u_min, u_max, v_min, v_max; pixels), and its nearest depth.
 
     Empty (u_max < u_min) for what lies behind the camera. Boxes that reach behind it are clipped.
     """
     centers = solids.center_P3 + solids.velocity_P3 * time - pose.position_3
-    spokes = solids.rotation_P33[:, None] * (_CORNERS[:, None, :] * solids.half_P3[:, None, None, :])
+    spokes = solids.rotation_P33[:, None] * (
+        _CORNERS[:, None, :] * solids.half_P3[:, None, None, :]
+    )
     world_P83 = spokes.sum(-1) + centers[:, None]
     points = (world_P83[..., None] * pose.rotation_33[None, None]).sum(2)
     a, b = points[:, _EDGES[:, 0]], points[:, _EDGES[:, 1]]
@@ -165,15 +175,16 @@ def screen_bounds(solids: Solids, pose: Pose, camera: Camera, time: int) -> tupl
     z = np.where(seen, points[..., 2], 1.0)
     u = points[..., 0] / z * camera.fx + camera.u0
     v = points[..., 1] / z * camera.fy + camera.v0
-    low, high = (np.where(seen, q, np.inf).min(1) for q in (u, v)), (
-        np.where(seen, q, -np.inf).max(1) for q in (u, v)
+    low, high = (
+        (np.where(seen, q, np.inf).min(1) for q in (u, v)),
+        (np.where(seen, q, -np.inf).max(1) for q in (u, v)),
     )
     (u_min, v_min), (u_max, v_max) = low, high
     nearest = np.where(seen, points[..., 2], np.inf).min(1)
     return np.stack([u_min, u_max, v_min, v_max], 1), nearest.astype(np.float32)
 
 
-# --- rays in unit space: origin o and direction d as three broadcastable arrays -> depth or inf ----
+# --- rays in unit space: origin o and direction d as three broadcastable arrays -> depth ----
 
 
 def hit(kind: int, o: tuple, d: tuple, taper: tuple) -> FloatArray:
@@ -229,9 +240,9 @@ def unit_normals(kind: NDArray, p: FloatArray, taper: FloatArray) -> FloatArray:
     lean = kind == TAPERED
     normal[lean] = _tapered_normals(p[lean], taper[lean] / 2)
     tube = kind == CYLINDER
-    q = p[tube] * np.float32([1, 0, 1])
+    q = p[tube] * np.array([1, 0, 1], np.float32)
     cap = (q * q).sum(1) < 0.998 * p[tube, 1] ** 2
-    q[cap] = np.sign(p[tube][cap]) * np.float32([0, 1, 0])
+    q[cap] = np.sign(p[tube][cap]) * np.array([0, 1, 0], np.float32)
     normal[tube] = q
     return normal
 

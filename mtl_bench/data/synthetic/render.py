@@ -11,10 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtl_bench.data.synthetic import shade, street, traffic
-from mtl_bench.data.synthetic.camera import Camera, FloatArray, Motion, Pose, draw_camera, draw_motion
+from mtl_bench.data.synthetic.camera import (
+    Camera,
+    FloatArray,
+    Motion,
+    Pose,
+    draw_camera,
+    draw_motion,
+)
 from mtl_bench.data.synthetic.cast import cast
-from mtl_bench.data.synthetic.primitives import Solids, unit_frames
-from mtl_bench.data.synthetic.texture import Markings
+from mtl_bench.data.synthetic.material import Markings
+from mtl_bench.data.synthetic.primitives import (
+    CYLINDER,
+    ELLIPSOID,
+    Solids,
+    unit_frames,
+    unit_normals,
+)
 
 RENDERER_VERSION = 1  # raised with every change of what is drawn
 EGO, SKY = 1, 23
@@ -30,7 +43,9 @@ class Scene:
     markings: Markings
     shadows_S7: FloatArray
     light: shade.Light
-    bonnet: tuple[float, float, float]  # edge in the middle and drop to the sides (of H), shift (of W)
+    bonnet: tuple[
+        float, float, float
+    ]  # edge in the middle and drop to the sides (of H), shift (of W)
     bonnet_color_3: FloatArray
 
     def viewer(self, frame: int) -> Pose:
@@ -54,7 +69,9 @@ class Truth:
     moving_HW: NDArray[np.bool_]
 
 
-def draw_scene(seed: tuple[int, ...], height: int, width: int, frames: int, annotated: int) -> Scene:
+def draw_scene(
+    seed: tuple[int, ...], height: int, width: int, frames: int, annotated: int
+) -> Scene:
     """The street of one seed; the same street at every size."""
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     camera = draw_camera(rng, height, width)
@@ -105,38 +122,79 @@ def instance_ids(seen: Truth, min_area: int) -> NDArray[np.uint16]:
 
 def image(scene: Scene, frame: int) -> NDArray[np.uint8]:
     """Colour image [H,W,3] RGB."""
+    return (radiance(scene, frame) * 255 + 0.5).astype(np.uint8)
+
+
+def radiance(scene: Scene, frame: int) -> FloatArray:
+    """The image [H,W,3] before it is rounded to 8 bits: 0..1, display gamma."""
     camera, pose = scene.camera, scene.motion.poses[frame]
     height, width = camera.height, camera.width
     time = frame - scene.annotated
-    quarter = np.float32([-0.25, 0.25])
+    quarter = np.array([-0.25, 0.25], np.float32)
     u, v = _centres(camera)
     u2, v2 = (u[:, None] + quarter).ravel(), (v[:, None] + quarter).ravel()
     depth, index = cast(scene.solids, camera, pose, time, u2, v2)
-    blocks = index.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
+    surface = index * 4 + _faces(scene, frame, u2, v2, index, depth)
+    blocks = surface.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
     depths = depth.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
     mixed = (blocks != blocks[..., :1]).any(-1)
     with np.errstate(divide="ignore"):
         middle = 4 / (1 / depths).sum(-1)  # exact for planes: inverse depth is linear in the image
     rows, cols = np.nonzero(~mixed)
     out = np.empty((height, width, 3), np.float32)
-    out[rows, cols] = _colors(scene, frame, u[cols], v[rows], blocks[rows, cols, 0], middle[rows, cols])
+    out[rows, cols] = _colors(
+        scene, frame, u[cols], v[rows], blocks[rows, cols, 0] >> 2, middle[rows, cols]
+    )
     rows, cols = np.nonzero(mixed)
     if len(rows):
         du, dv = np.tile(quarter, 2), np.repeat(quarter, 2)
         us, vs = (u[cols, None] + du).ravel(), (v[rows, None] + dv).ravel()
-        four = _colors(scene, frame, us, vs, blocks[rows, cols].ravel(), depths[rows, cols].ravel())
+        four = _colors(
+            scene, frame, us, vs, blocks[rows, cols].ravel() >> 2, depths[rows, cols].ravel()
+        )
         out[rows, cols] = four.reshape(-1, 4, 3).mean(1)
     _draw_bonnet(scene, out, u, v)
-    tone = np.clip(out, 0, 1) ** np.float32(0.9)
-    return (tone * 255 + 0.5).astype(np.uint8)
+    toned: FloatArray = np.clip(out, 0, 1) ** np.float32(0.9)
+    return toned
 
 
 def _centres(camera: Camera) -> tuple[FloatArray, FloatArray]:
     return np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32)
 
 
+def _faces(
+    scene: Scene, frame: int, u_W: FloatArray, v_H: FloatArray, index: NDArray, depth: FloatArray
+) -> NDArray[np.int32]:
+    """Which pair of faces of a box or cylinder a ray hits, 0..2; 0 for the round and the sky."""
+    rows, cols = np.nonzero(index >= 0)
+    hit = index[rows, cols]
+    camera = scene.camera
+    directions, origins = unit_frames(
+        scene.solids, scene.motion.poses[frame], frame - scene.annotated
+    )
+    x = ((u_W - camera.u0) / camera.fx).astype(np.float32)[cols]
+    y = ((v_H - camera.v0) / camera.fy).astype(np.float32)[rows]
+    t, m = depth[rows, cols], directions[hit]
+    p = np.stack(
+        [origins[hit, i] + (m[:, i, 0] * x + m[:, i, 1] * y + m[:, i, 2]) * t for i in range(3)], 1
+    )
+    kind = scene.solids.kind_P[hit]
+    normal = np.abs(unit_normals(kind, p, scene.solids.taper_P3[hit]))
+    face = normal.argmax(1)
+    face[kind == CYLINDER] = normal[kind == CYLINDER, 1] > 0.5
+    face[kind == ELLIPSOID] = 0
+    out = np.zeros(index.shape, np.int32)
+    out[rows, cols] = face
+    return out
+
+
 def _colors(
-    scene: Scene, frame: int, u_N: FloatArray, v_N: FloatArray, index_N: NDArray, depth_N: FloatArray
+    scene: Scene,
+    frame: int,
+    u_N: FloatArray,
+    v_N: FloatArray,
+    index_N: NDArray,
+    depth_N: FloatArray,
 ) -> FloatArray:
     """Colours [N,3] of what the rays through (u, v) see at a known depth."""
     camera, pose = scene.camera, scene.motion.poses[frame]
@@ -154,7 +212,9 @@ def _colors(
     world = pose.position_3.astype(np.float32) + ray[s] * depth[:, None]
     shadows = scene.shadows_S7.copy()
     shadows[:, :2] += shadows[:, 5:7] * time
-    flat = np.stack([*shadows[:, :2].T, np.cos(shadows[:, 2]), np.sin(shadows[:, 2]), *shadows[:, 3:5].T], 1)
+    flat = np.stack(
+        [*shadows[:, :2].T, np.cos(shadows[:, 2]), np.sin(shadows[:, 2]), *shadows[:, 3:5].T], 1
+    )
     out[s] = shade.surface(
         scene.solids, scene.light, scene.markings, flat, index, unit, world,
         scene.viewer(frame), 1 / camera.fx,
@@ -163,7 +223,7 @@ def _colors(
 
 
 def _bonnet(scene: Scene, u: FloatArray, v: FloatArray) -> FloatArray:
-    """How far [H,W] below the bonnet's edge a pixel centre lies, in pixels; the same in all frames."""
+    """How far [H,W] below the bonnet's edge a pixel centre lies, in pixels; in every frame."""
     top, drop, shift = scene.bonnet
     height, width = scene.camera.height, scene.camera.width
     across = (u / width - 0.5 - shift) * 2
@@ -174,6 +234,8 @@ def _draw_bonnet(scene: Scene, out: FloatArray, u: FloatArray, v: FloatArray) ->
     """Smooth paint that mirrors a little sky; its edge is anti-aliased, its mask is not."""
     below = _bonnet(scene, u, v)
     share = np.clip(below + 0.5, 0, 1)[..., None]
-    gloss = np.exp(-np.maximum(below, 0) / (0.03 * scene.camera.height))[..., None] * np.float32(0.35)
+    gloss = np.exp(-np.maximum(below, 0) / (0.03 * scene.camera.height))[..., None] * np.float32(
+        0.35
+    )
     color = scene.bonnet_color_3 * (scene.light.ambient_3 + 0.3) + gloss * scene.light.horizon_3
     out += (color - out) * share.astype(np.float32)

@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtl_bench.data.synthetic.camera import FloatArray, Pose
+from mtl_bench.data.synthetic.material import Markings, Material, Patch
 from mtl_bench.data.synthetic.noise import fractal_noise, lattice_noise
 from mtl_bench.data.synthetic.primitives import Solids, unit_normals
-from mtl_bench.data.synthetic.texture import ALONG, OCTAVES, PATCHES, Markings, Material, Patch
-
-_FILTER_PX = np.float32(3.0)  # width of the patterns' box filter
+from mtl_bench.data.synthetic.texture import ALONG, FILTER_PX, FINE, OCTAVES, PATCHES
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def sky(light: Light, direction_N3: FloatArray) -> FloatArray:
     flat = d / (np.abs(d[:, 1:2]) + 0.25) * np.float32(1.6) + np.float32(light.seed)
     puffs = lattice_noise(flat) + 0.5 * lattice_noise(flat * 2.3)
     share = np.clip(puffs * 0.9 + light.cloud - 0.35, 0, 1)[:, None] * np.sqrt(rise) * 0.8
-    white = np.float32([0.95, 0.95, 0.96]) * light.horizon_3.max()
+    white = np.array([0.95, 0.95, 0.96], np.float32) * light.horizon_3.max()
     return color + (white - color) * share
 
 
@@ -102,34 +101,54 @@ def surface(
     along = ALONG[material]
     points = np.where(fixed, world_N3, p + shift)
     points[:, 2] *= along
-    noise = fractal_noise(points, OCTAVES[material], np.maximum(footprint, along * stretched))
+    noise = fractal_noise(
+        points, OCTAVES[material], FINE[material] * np.maximum(footprint, along * stretched)
+    )
     albedo = np.empty_like(p)
     for m in np.unique(material):
         s = np.flatnonzero(material == m)
+        blur = FILTER_PX[m]
         patch = Patch(
-            p[s], half[s], face[s], world_N3[s], _FILTER_PX * footprint[s],
-            _FILTER_PX * stretched[s], solids.color_P3[index_N[s]],
-            solids.color2_P3[index_N[s]], solids.params_P4[index_N[s]], noise[s], markings,
+            p[s],
+            half[s],
+            face[s],
+            world_N3[s],
+            blur * footprint[s],
+            blur * stretched[s],
+            solids.color_P3[index_N[s]],
+            solids.color2_P3[index_N[s]],
+            solids.params_P4[index_N[s]],
+            noise[s],
+            markings,
         )
         albedo[s] = PATCHES[Material(m)][0](patch)
     albedo *= np.clip(1 + 0.75 * noise, 0.25, 1.9)[:, None]
     shade = np.clip((normal * light.sun_3).sum(1), 0, 1)[:, None]
     sky_share = 0.72 - 0.28 * normal[:, 1:2]  # surfaces that look up see more of the sky
-    contact = _contact(shadows, world_N3)[:, None]
+    contact = _contact(shadows, world_N3, footprint, stretched)[:, None]
     color = albedo * (light.ambient_3 * sky_share + light.sun_color_3 * shade) * contact
     air = 1 - np.exp(-depth_N / np.float32(light.haze_m))[:, None]
     return color + (light.horizon_3 * 0.9 - color) * air
 
 
-def _contact(shadows: FloatArray, world_N3: FloatArray) -> FloatArray:
-    """Darkening of the ground under vehicles and people: 1 = none."""
+def _contact(
+    shadows: FloatArray, world_N3: FloatArray, wide_N: FloatArray, long_N: FloatArray
+) -> FloatArray:
+    """Darkening of the ground under vehicles and people, 1 = none; soft, and softer than a pixel.
+
+    wide_N and long_N: metres that the pixel covers across and along the view.
+    """
     dark = np.ones(len(world_N3), np.float32)
     ground = np.flatnonzero(world_N3[:, 1] > -0.2)
     x, z = world_N3[ground, 0], world_N3[ground, 2]
+    wide, long = 1.5 * wide_N[ground], 1.5 * long_N[ground]
     factor = np.ones(len(ground), np.float32)
     for sx, sz, c, s, hx, hz in shadows:
         dx, dz = x - sx, z - sz
-        a, b = (c * dx - s * dz) / hx, (s * dx + c * dz) / hz
-        factor *= 1 - np.float32(0.6) * np.clip(1.7 - 1.2 * (a**4 + b**4), 0, 1)
-    dark[ground] = np.maximum(factor, 0.3)
+        blur_x, blur_z = 0.15 + abs(c) * wide + abs(s) * long, 0.15 + abs(s) * wide + abs(c) * long
+        a, b = (c * dx - s * dz) / (hx + blur_x), (s * dx + c * dz) / (hz + blur_z)
+        depth = hx * hz / ((hx + blur_x) * (hz + blur_z))
+        q = np.clip(1.25 - 0.6 * (a * a + b * b), 0, 1)
+        factor *= 1 - np.float32(0.75) * depth * q * q * (3 - 2 * q)
+    dark[ground] = np.maximum(factor, 0.25)
     return dark

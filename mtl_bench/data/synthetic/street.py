@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mtl_bench.data.synthetic import furniture as f
+from mtl_bench.data.synthetic.material import Markings, Material
 from mtl_bench.data.synthetic.primitives import Collector, Paint, box
-from mtl_bench.data.synthetic.texture import Markings, Material
 
 START_M, FAR_M = -16.0, 130.0
 KERB_M = 0.13
@@ -83,10 +83,10 @@ def plan(rng: np.random.Generator) -> Street:
     half_lane = rng.uniform(1.7, 2.0)
     lanes_left = int(rng.choice([1, 2], p=[0.7, 0.3]))
     left_edge = half_lane + lanes_left * rng.uniform(2.9, 3.3)
-    if rng.random() < 0.34:
+    if rng.random() < 0.5:
         tram_x = -(half_lane + 1.7) if lanes_left == 1 else -(left_edge - 1.6)
         left_edge += 0.4
-    verge = {"city": 0.12, "suburb": 0.5, "avenue": 0.6}[style]
+    verge = {"city": 0.2, "suburb": 0.6, "avenue": 0.7}[style]
     sides = []
     for sign, edge in ((1, half_lane), (-1, left_edge)):
         grass = rng.uniform(1.0, 2.6) if rng.random() < verge else 0.0
@@ -107,15 +107,19 @@ def plan(rng: np.random.Generator) -> Street:
 def _ground(rng: np.random.Generator, street: Street) -> None:
     place = street.collector.place
     grass = _grass_paint(rng)
-    gray = rng.uniform(0.32, 0.46)
+    gray = rng.uniform(0.25, 0.37)
     asphalt = Paint(Material.ASPHALT, (gray, gray, gray * rng.uniform(0.97, 1.06)))
     slab = rng.uniform(0.5, 0.62)
     tone = rng.normal(0, 0.02, 3) + slab * np.array([1.02, 0.98, 0.92])
-    paving = Paint(Material.PAVING, tuple(tone.tolist()), (0.68, 0.68, 0.66), (rng.uniform(0.4, 1.1), 0, 0, 0))
+    paving = Paint(
+        Material.PAVING, tuple(tone.tolist()), (0.68, 0.68, 0.66), (rng.uniform(0.4, 1.1), 0, 0, 0)
+    )
     place([box((0, -1.03, 150), (600, 1, 700), grass, f.TERRAIN)], 0, 0)
     left, right = -street.left.kerb, street.right.kerb
     far = 400.0 if street.end_m is None else street.end_m + 12
-    road = box(((left + right) / 2, -1, (far - 30) / 2), (right - left, 1, far + 30), asphalt, f.ROAD)
+    road = box(
+        ((left + right) / 2, -1, (far - 30) / 2), (right - left, 1, far + 30), asphalt, f.ROAD
+    )
     place([road], 0, 0)
     roads = [] if street.crossing is None else [street.crossing]
     if street.end_m is not None:
@@ -195,21 +199,32 @@ def _plot(rng: np.random.Generator, street: Street, side: Side, z: float, length
     _boundary(rng, street, side, z, length)
     if kind < share[0] + share[1]:
         depth, gap = rng.uniform(8, 11), rng.uniform(1, 4) if length > 9 else 0.0
-        house = f.building(rng, (depth, rng.uniform(4.5, 8.5), length - gap), bool(rng.random() < 0.75))
+        house = f.building(
+            rng, (depth, rng.uniform(4.5, 8.5), length - gap), bool(rng.random() < 0.75)
+        )
         set_back = rng.uniform(3, 7)
         place(house, side.sign * (side.front + set_back + depth / 2), middle, base_m=KERB_M - 0.02)
         if rng.random() < 0.5:
             x = side.sign * (side.front + rng.uniform(1.2, 2.2))
-            place(f.bush(rng, rng.uniform(0.9, 1.6)), x, z + rng.uniform(1, length), base_m=KERB_M - 0.02)
+            place(
+                f.bush(rng, rng.uniform(0.9, 1.6)),
+                x,
+                z + rng.uniform(1, length),
+                base_m=KERB_M - 0.02,
+            )
     else:
         for _ in range(int(rng.integers(1, 4))):
             x = side.sign * (side.front + rng.uniform(2.5, 14))
-            place(f.tree(rng, rng.uniform(5, 10)), x, z + rng.uniform(0, length), base_m=KERB_M - 0.02)
+            place(
+                f.tree(rng, rng.uniform(5, 10)), x, z + rng.uniform(0, length), base_m=KERB_M - 0.02
+            )
 
 
-def _boundary(rng: np.random.Generator, street: Street, side: Side, z: float, length: float) -> None:
+def _boundary(
+    rng: np.random.Generator, street: Street, side: Side, z: float, length: float
+) -> None:
     """What separates private ground from the sidewalk: wall, fence, hedge or nothing."""
-    make = rng.choice(4, p=[0.33, 0.33, 0.18, 0.16])
+    make = rng.choice(4, p=[0.3, 0.4, 0.16, 0.14])
     if make == 3:
         return
     part = (f.wall, f.fence, f.hedge)[make](rng, length)
@@ -239,7 +254,7 @@ def _far_end(rng: np.random.Generator, street: Street) -> None:
             length = rng.uniform(12, 24)
             house = f.building(rng, (12, rng.uniform(8, 16), length), bool(rng.random() < 0.4))
             place(house, x + length / 2, z, np.pi / 2)
-            x += length + (rng.random() < 0.3) * 4
+            x += length + (4.0 if rng.random() < 0.3 else 0.0)
         return
     for _ in range(int(rng.integers(4, 12))):
         x, z = rng.uniform(-60, 60), rng.uniform(150, 240)

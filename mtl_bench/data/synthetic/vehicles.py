@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mtl_bench.data.synthetic.material import Material
 from mtl_bench.data.synthetic.people import clothes, rider
 from mtl_bench.data.synthetic.primitives import Paint, Part, ball, box, rod
-from mtl_bench.data.synthetic.texture import Material
 
 CAR, TRUCK, BUS, TRAIN, MOTORCYCLE, BICYCLE = 26, 27, 28, 31, 32, 33
 _CAR_COLORS = (
@@ -26,7 +26,9 @@ class Vehicle:
     length: float
 
 
-def _near(rng: np.random.Generator, color: tuple, spread: float = 0.04) -> tuple[float, float, float]:
+def _near(
+    rng: np.random.Generator, color: tuple, spread: float = 0.04
+) -> tuple[float, float, float]:
     r, g, b = np.clip(np.array(color) + rng.normal(0, spread, 3), 0.03, 0.95).tolist()
     return r, g, b
 
@@ -55,7 +57,9 @@ def car(rng: np.random.Generator) -> Vehicle:
     cabin = Paint(Material.CABIN, color, params=(0.14, 0.84, 0.06, 0))
     parts = [
         box((0, 0.2, 0), (width, belt - 0.2, length), body, CAR, (0.05, 0.03, 0.02)),
-        box((0, belt, back), (width * 0.97, height - belt, cab_length), cabin, CAR, (0.2, 0.5, rear)),
+        box(
+            (0, belt, back), (width * 0.97, height - belt, cab_length), cabin, CAR, (0.2, 0.5, rear)
+        ),
         *_wheels(width, [-0.3 * length, 0.31 * length], 0.32, CAR),
     ]
     return Vehicle(parts, width, length)
@@ -64,15 +68,28 @@ def car(rng: np.random.Generator) -> Vehicle:
 def truck(rng: np.random.Generator) -> Vehicle:
     """A cab before a box, a tarpaulin or an open bed."""
     width, length, height = rng.uniform(2.2, 2.5), rng.uniform(5.8, 8.5), rng.uniform(2.7, 3.5)
-    color = _near(rng, ((0.85, 0.85, 0.85), (0.75, 0.12, 0.1), (0.15, 0.3, 0.6), (0.9, 0.6, 0.1))[rng.integers(4)])
-    load = _near(rng, ((0.82, 0.82, 0.8), (0.25, 0.4, 0.6), (0.75, 0.7, 0.3), (0.35, 0.5, 0.35))[rng.integers(4)])
+    color = _near(
+        rng,
+        ((0.85, 0.85, 0.85), (0.75, 0.12, 0.1), (0.15, 0.3, 0.6), (0.9, 0.6, 0.1))[rng.integers(4)],
+    )
+    load = _near(
+        rng,
+        ((0.82, 0.82, 0.8), (0.25, 0.4, 0.6), (0.75, 0.7, 0.3), (0.35, 0.5, 0.35))[rng.integers(4)],
+    )
     ribs = tuple(0.82 * c for c in load)
-    cargo = Paint(Material.SLATS, load, ribs, (rng.uniform(0.5, 0.9), 0.9, rng.integers(2), 0))
+    cargo = Paint(
+        Material.SLATS, load, ribs, (rng.uniform(0.5, 0.9), 0.9, float(rng.integers(2)), 0)
+    )
     cab = Paint(Material.CABIN, color, params=(0.5, 0.86, 0.07, 0))
     load_length = length - 2.1
     bed = height if rng.random() < 0.8 else 1.7
     parts = [
-        box((0, 0.55, 0), (width * 0.9, 0.4, length), Paint(Material.PLAIN, (0.12, 0.12, 0.13)), TRUCK),
+        box(
+            (0, 0.55, 0),
+            (width * 0.9, 0.4, length),
+            Paint(Material.PLAIN, (0.12, 0.12, 0.13)),
+            TRUCK,
+        ),
         box((0, 0.9, -1.05), (width, bed - 0.9, load_length), cargo, TRUCK),
         box((0, 0.45, length / 2 - 0.95), (width * 0.96, 2.2, 1.9), cab, TRUCK, (0.08, 0.12, 0.01)),
         *_wheels(width, [-0.32 * length, -0.18 * length, 0.36 * length], 0.48, TRUCK),
@@ -85,7 +102,10 @@ def truck(rng: np.random.Generator) -> Vehicle:
 
 def bus(rng: np.random.Generator) -> Vehicle:
     width, length, height = 2.5, rng.uniform(9.5, 12.5), rng.uniform(2.9, 3.2)
-    color = _near(rng, ((0.9, 0.75, 0.15), (0.75, 0.1, 0.1), (0.85, 0.85, 0.8), (0.2, 0.5, 0.35))[rng.integers(4)])
+    color = _near(
+        rng,
+        ((0.9, 0.75, 0.15), (0.75, 0.1, 0.1), (0.85, 0.85, 0.8), (0.2, 0.5, 0.35))[rng.integers(4)],
+    )
     stripe = _near(rng, ((0.8, 0.8, 0.8), (0.2, 0.25, 0.4), (0.6, 0.1, 0.1))[rng.integers(3)])
     paint = Paint(Material.COACH, color, stripe, (0.42, 0.8, rng.uniform(1.3, 1.7), 0.14))
     parts = [
@@ -111,7 +131,14 @@ def tram(rng: np.random.Generator) -> Vehicle:
         nose = (0.03, 0.08 * (i == cars - 1), 0.08 * (i == 0))
         parts.append(box((0, 0.35, z), (width, height - 0.35, one - 0.35), paint, TRAIN, nose))
         parts.append(box((0, 0.08, z), (width * 0.8, 0.3, one * 0.6), dark, TRAIN))
-        parts.append(box((0, height, z), (1.4, 0.25, one * 0.5), Paint(Material.PLAIN, (0.4, 0.4, 0.42)), TRAIN))
+        parts.append(
+            box(
+                (0, height, z),
+                (1.4, 0.25, one * 0.5),
+                Paint(Material.PLAIN, (0.4, 0.4, 0.42)),
+                TRAIN,
+            )
+        )
     for i in range(cars - 1):
         z = (i + 1 - cars / 2) * one
         parts.append(box((0, 0.5, z), (width * 0.9, height - 0.7, 0.4), dark, TRAIN))
@@ -121,7 +148,10 @@ def tram(rng: np.random.Generator) -> Vehicle:
 
 def motorcycle(rng: np.random.Generator, ridden: bool) -> Vehicle:
     """A motorcycle or scooter, with or without its rider."""
-    color = _near(rng, ((0.7, 0.08, 0.06), (0.1, 0.1, 0.12), (0.1, 0.25, 0.6), (0.85, 0.55, 0.1))[rng.integers(4)])
+    color = _near(
+        rng,
+        ((0.7, 0.08, 0.06), (0.1, 0.1, 0.12), (0.1, 0.25, 0.6), (0.85, 0.55, 0.1))[rng.integers(4)],
+    )
     paint, dark = Paint(Material.PLAIN, color), Paint(Material.PLAIN, _DARK)
     chrome = Paint(Material.PLAIN, (0.6, 0.6, 0.62))
     wheel = Paint(Material.WHEEL, (0.35, 0.35, 0.37), params=(0.35, 0, 0, 0))
@@ -146,7 +176,12 @@ def motorcycle(rng: np.random.Generator, ridden: bool) -> Vehicle:
 
 def bicycle(rng: np.random.Generator, ridden: bool) -> Vehicle:
     """A bicycle, with or without its rider; wheels count as filled, as annotators draw them."""
-    color = _near(rng, ((0.1, 0.35, 0.6), (0.65, 0.1, 0.1), (0.12, 0.12, 0.13), (0.2, 0.5, 0.25), (0.8, 0.8, 0.8))[rng.integers(5)])
+    color = _near(
+        rng,
+        ((0.1, 0.35, 0.6), (0.65, 0.1, 0.1), (0.12, 0.12, 0.13), (0.2, 0.5, 0.25), (0.8, 0.8, 0.8))[
+            rng.integers(5)
+        ],
+    )
     paint, dark = Paint(Material.PLAIN, color), Paint(Material.PLAIN, _DARK)
     wheel = Paint(Material.WHEEL, (0.42, 0.42, 0.41), params=(0.16, 0, 0, 0))
     b, r = BICYCLE, 0.35

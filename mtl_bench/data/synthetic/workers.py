@@ -33,10 +33,7 @@ def render_all(root: Path, settings: Settings, processes: int | None, progress: 
     total = len(settings.scenes)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     count = max(1, min(processes or cores or 1, total))
-    if count == 1:
-        lines = _own(root, settings)
-    else:
-        lines = _children(root, settings, count)
+    lines = _own(root, settings) if count == 1 else _children(root, settings, count)
     entries = list(_shown(lines, total, settings) if progress else lines)
     write_summary(root, settings, entries)
 
@@ -62,7 +59,12 @@ def _children(root: Path, settings: Settings, count: int) -> Iterator[dict[str, 
     lines: queue.Queue[str | int] = queue.Queue()
 
     def start(number: int) -> subprocess.Popen[str]:
-        job = {"root": str(root.resolve()), "settings": asdict(settings), "first": number, "step": count}
+        job = {
+            "root": str(root.resolve()),
+            "settings": asdict(settings),
+            "first": number,
+            "step": count,
+        }
         return subprocess.Popen(
             [sys.executable, "-m", "mtl_bench.data.synthetic", json.dumps(job)],
             stdout=subprocess.PIPE, text=True, env=environment,
@@ -94,7 +96,9 @@ def _children(root: Path, settings: Settings, count: int) -> Iterator[dict[str, 
             child.wait()
 
 
-def _shown(lines: Iterator[dict[str, Any]], total: int, settings: Settings) -> Iterator[dict[str, Any]]:
+def _shown(
+    lines: Iterator[dict[str, Any]], total: int, settings: Settings
+) -> Iterator[dict[str, Any]]:
     """Pass through, drawing a bar in a terminal and a line per tenth elsewhere."""
     title = f"rendering {total} street scenes at {settings.height}x{settings.width}"
     console = Console(stderr=True)
