@@ -8,6 +8,7 @@ appears under its name by a rename at the very end: what has the name is whole.
 
 import contextlib
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -96,19 +97,26 @@ def write(
 
 
 def _settings(
-    height: int, width: int, train: int, val: int, test: int, seed: int, frames: int, annotated: int,
+    height: int,
+    width: int,
+    train: int,
+    val: int,
+    test: int,
+    seed: int,
+    frames: int,
+    annotated: int,
     min_area: int | None,
-) -> Settings:  # fmt: skip
+) -> Settings:
     if min_area is None:
         min_area = max(1, round(12 * height * width / (64 * 128)))
     return Settings(height, width, train, val, test, seed, frames, annotated, min_area)
 
 
 def _render(out: Path, settings: Settings, processes: int | None, progress: bool) -> None:
-    """Render beside the final place, then move: a killed run leaves nothing under the final name."""
-    partial = out.with_name(f"{out.name}.partial")
-    if partial.exists():  # of a run that was killed: we hold the lock, so nobody writes there
-        shutil.rmtree(partial)
+    """Render beside the final place, then move: a killed run leaves nothing under that name."""
+    for remains in out.parent.glob(f"{out.name}.partial-*"):  # of killed runs: we hold the lock
+        shutil.rmtree(remains, ignore_errors=True)  # their last worker may still be writing
+    partial = out.with_name(f"{out.name}.partial-{secrets.token_hex(4)}")
     partial.mkdir(parents=True)
     render_all(partial, settings, processes, progress)
     if out.exists():

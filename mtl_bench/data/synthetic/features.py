@@ -14,7 +14,7 @@ from mtl_bench.data.synthetic import vehicles as v
 from mtl_bench.data.synthetic.crowd import PATH_M, Crowd
 from mtl_bench.data.synthetic.people import person
 from mtl_bench.data.synthetic.primitives import Part
-from mtl_bench.data.synthetic.street import Side
+from mtl_bench.data.synthetic.street import KERB_M, Side
 
 
 def _kerb_place(
@@ -116,10 +116,8 @@ def _large(make: Callable[[np.random.Generator], v.Vehicle]) -> Callable:
         if kind < 0.45:
             side = street.right if rng.random() < 0.5 else street.left
             x = side.sign * (side.kerb - made.width / 2 - 0.15)
-            if (
-                (side.sign > 0
-                and x - made.width / 2 < PATH_M)
-                or not street.along(z, made.length / 2)
+            if (side.sign > 0 and x - made.width / 2 < PATH_M) or not street.along(
+                z, made.length / 2
             ):
                 return False
             return crowd.vehicle(made, x, z, 0.0 if side.sign > 0 else np.pi)

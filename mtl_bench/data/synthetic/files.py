@@ -203,8 +203,8 @@ def _camera(scene: render.Scene) -> dict[str, dict[str, float]]:
     camera = scene.camera
     return {
         "extrinsic": {
-            "baseline": BASELINE_M, "pitch": scene.motion.pitch_rad, "roll": 0.0, "x": 1.7, "y": 0.0,
-            "yaw": 0.0, "z": camera.mount_m,
+            "baseline": BASELINE_M, "pitch": scene.motion.pitch_rad, "roll": 0.0, "x": 1.7,
+            "y": 0.0, "yaw": 0.0, "z": camera.mount_m,
         },
         "intrinsic": {"fx": camera.fx, "fy": camera.fy, "u0": camera.u0, "v0": camera.v0},
     }  # fmt: skip

@@ -11,6 +11,7 @@ _PLASTER = (
     (0.72, 0.64, 0.5), (0.66, 0.48, 0.38), (0.78, 0.76, 0.7), (0.55, 0.3, 0.24), (0.6, 0.6, 0.6),
     (0.82, 0.72, 0.48), (0.62, 0.56, 0.54), (0.5, 0.42, 0.36), (0.7, 0.55, 0.5),
 )  # fmt: skip
+_CROWNS = ((0.3, 0.48, 0.14), (0.22, 0.42, 0.15), (0.42, 0.5, 0.16), (0.5, 0.42, 0.12))
 _METAL = ((0.42, 0.44, 0.45), (0.3, 0.32, 0.32), (0.55, 0.56, 0.56), (0.2, 0.25, 0.22))
 
 
@@ -45,9 +46,9 @@ def building(rng: np.random.Generator, size: Point, pitched: bool) -> list[Part]
 
 def tree(rng: np.random.Generator, height: float) -> list[Part]:
     """A trunk that forks under a crown of overlapping clumps."""
-    green = _vary(rng, ((0.3, 0.48, 0.14), (0.22, 0.42, 0.15), (0.42, 0.5, 0.16), (0.5, 0.42, 0.12))[
-        rng.choice(4, p=[0.4, 0.35, 0.15, 0.1])], 0.08)  # fmt: skip
-    leaves = Paint(Material.FOLIAGE, green, tuple(0.35 * c for c in green))
+    kind = rng.choice(4, p=[0.4, 0.35, 0.15, 0.1])
+    green = _vary(rng, _CROWNS[kind], 0.08)
+    leaves = Paint(Material.FOLIAGE, green, tuple(0.45 * c for c in green))
     bark = Paint(Material.PLAIN, _vary(rng, (0.27, 0.2, 0.15)))
     fork, crown = height * rng.uniform(0.3, 0.4), height * rng.uniform(0.5, 0.68)
     v = VEGETATION
@@ -79,7 +80,7 @@ def tree(rng: np.random.Generator, height: float) -> list[Part]:
 
 def bush(rng: np.random.Generator, size: float) -> list[Part]:
     green = _vary(rng, (0.26, 0.42, 0.13), 0.1)
-    leaves = Paint(Material.FOLIAGE, green, tuple(0.35 * c for c in green))
+    leaves = Paint(Material.FOLIAGE, green, tuple(0.45 * c for c in green))
     parts = []
     for _ in range(4):
         x, z = rng.uniform(-0.35, 0.35, 2) * size
@@ -91,7 +92,7 @@ def bush(rng: np.random.Generator, size: float) -> list[Part]:
 def hedge(rng: np.random.Generator, length: float) -> list[Part]:
     """A clipped hedge along z."""
     green = _vary(rng, (0.2, 0.36, 0.11), 0.1)
-    leaves = Paint(Material.FOLIAGE, green, tuple(0.35 * c for c in green))
+    leaves = Paint(Material.FOLIAGE, green, tuple(0.45 * c for c in green))
     return [
         box((0, 0, 0), (0.9, rng.uniform(1.0, 2.2), length), leaves, VEGETATION, (0.12, 0.02, 0.02))
     ]

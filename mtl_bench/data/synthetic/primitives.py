@@ -59,11 +59,14 @@ def ball(at: Point, size: Point, paint: Paint, label: int) -> Part:
 def rod(start: Point, end: Point, radius: float, paint: Paint, label: int) -> Part:
     """A cylinder between two points (x, height, z)."""
     a, b = np.array(start) * [1, -1, 1], np.array(end) * [1, -1, 1]
-    axis = (b - a) / np.linalg.norm(b - a)
-    side = np.cross(axis, [0.0, 0, 1] if abs(axis[2]) < 0.9 else [1.0, 0, 0])
-    side /= np.linalg.norm(side)
-    turned = np.stack([side, axis, np.cross(side, axis)], 1)
-    half = (radius, float(np.linalg.norm(b - a)) / 2, radius)
+    length = float(np.sqrt(((b - a) ** 2).sum()))
+    i, j, k = ((b - a) / length).tolist()
+    p, q, r = (j, -i, 0.0) if abs(k) < 0.9 else (0.0, k, -j)  # axis x (0, 0, 1) or (1, 0, 0)
+    n = (p * p + q * q + r * r) ** 0.5
+    p, q, r = p / n, q / n, r / n
+    other = (q * k - r * j, r * i - p * k, p * j - q * i)  # side x axis
+    turned = np.array([(p, i, other[0]), (q, j, other[1]), (r, k, other[2])])
+    half = (radius, length / 2, radius)
     x, y, z = ((a + b) / 2).tolist()
     return Part(CYLINDER, (x, y, z), half, paint, label, turned)
 

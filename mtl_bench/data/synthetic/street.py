@@ -260,8 +260,10 @@ def _far_end(rng: np.random.Generator, street: Street) -> None:
         x, z = rng.uniform(-60, 60), rng.uniform(150, 240)
         if abs(x) > 8:
             place(f.tree(rng, rng.uniform(8, 16)), x, z)
-    for x in np.arange(-150, 150, 40):
+    for middle in range(-150, 150, 40):
         if rng.random() < 0.6:
             size = (rng.uniform(50, 90), rng.uniform(8, 24), 40)
             leaves = Paint(Material.FOLIAGE, (0.25, 0.36, 0.18), (0.14, 0.22, 0.1))
-            place([f.ball((0, 0, 0), size, leaves, f.VEGETATION)], x + rng.uniform(-15, 15), 290)
+            place(
+                [f.ball((0, 0, 0), size, leaves, f.VEGETATION)], middle + rng.uniform(-15, 15), 290
+            )

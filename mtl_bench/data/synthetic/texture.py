@@ -11,11 +11,11 @@ from mtl_bench.data.synthetic.material import Material, Patch
 #: function, noise strength per wavelength (6.4, 2.3, .85, .32, .12, .045 m)
 PATCHES: dict[Material, tuple[Callable[[Patch], FloatArray], tuple[float, ...]]] = {
     Material.PLAIN: (grounds.plain, (0.1, 0.2, 0.25, 0.25, 0.2, 0.15)),
-    Material.FACADE: (grounds.facade, (0.9, 1.0, 0.4, 0.25, 0.2, 0.2)),
+    Material.FACADE: (grounds.facade, (0.9, 0.75, 0.35, 0.25, 0.2, 0.2)),
     Material.ASPHALT: (grounds.asphalt, (0.8, 1.2, 0.5, 0.35, 0.3, 0.25)),
     Material.PAVING: (grounds.paving, (0.5, 0.9, 0.4, 0.3, 0.25, 0.2)),
     Material.GRASS: (grounds.grass, (0.5, 0.9, 0.6, 0.5, 0.45, 0.4)),
-    Material.FOLIAGE: (grounds.foliage, (0.0, 0.5, 1.0, 1.2, 1.0, 0.8)),
+    Material.FOLIAGE: (grounds.foliage, (0.0, 0.4, 0.5, 0.6, 0.8, 0.8)),
     Material.SLATS: (grounds.slats, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
     Material.MASONRY: (grounds.masonry, (0.35, 0.4, 0.4, 0.3, 0.25, 0.2)),
     Material.BODY: (bodies.body, (0.0, 0.15, 0.2, 0.15, 0.1, 0.05)),
@@ -34,8 +34,8 @@ _STRETCH |= dict.fromkeys((Material.FACADE, Material.SLATS, Material.MASONRY), 0
 #: width of the patterns' filter in pixels: wide where surfaces are large and pass close by, as
 #: whoever warps a frame interpolates between its pixels; narrow on small things, to keep their look
 _FILTER = dict.fromkeys((Material.PAVING, Material.SLATS, Material.MASONRY), 3.5)
-_FILTER |= dict.fromkeys((Material.BODY, Material.CABIN, Material.COACH), 1.8)
-_FILTER |= {Material.ASPHALT: 5.0, Material.FACADE: 4.0, Material.ROOF: 3.0}
+_FILTER |= dict.fromkeys((Material.BODY, Material.CABIN, Material.COACH), 2.2)
+_FILTER |= {Material.ASPHALT: 5.0, Material.FACADE: 4.5, Material.ROOF: 3.0}
 #: share of the pixel at which noise is faded: leaves may be finer than what interpolation likes
 _FINE = {Material.FOLIAGE: 0.5, Material.PERSON: 0.7}
 OCTAVES = np.array([PATCHES[m][1] for m in Material], np.float32)

@@ -57,7 +57,7 @@ def _moving(rng: np.random.Generator, crowd: Crowd) -> None:
 
 
 def _parked(rng: np.random.Generator, crowd: Crowd) -> None:
-    """Rows along the kerb where there is a parking lane, single cars half on the verge elsewhere."""
+    """Rows along the kerb where there is a parking lane."""
     street = crowd.street
     for side in street.sides:
         filled = rng.uniform(0.4, 0.9) if side.parking else 0.0

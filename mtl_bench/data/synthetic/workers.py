@@ -43,7 +43,11 @@ def work() -> None:
     job = json.loads(sys.argv[1])
     settings = Settings(**job["settings"])
     for split, scene in settings.scenes[job["first"] :: job["step"]]:
-        print(json.dumps(write_scene(Path(job["root"]), settings, split, scene)), flush=True)
+        line = json.dumps(write_scene(Path(job["root"]), settings, split, scene))
+        try:
+            print(line, flush=True)
+        except BrokenPipeError:  # the parent is gone
+            os._exit(1)
 
 
 def _own(root: Path, settings: Settings) -> Iterator[dict[str, Any]]:
