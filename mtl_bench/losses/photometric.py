@@ -66,6 +66,8 @@ def photometric_loss(
       candidate for the minimum; a pixel that no warped frame shows is left out of the mean.
     - `automask` puts the unwarped frames among the candidates. A tie goes to them: such a pixel
       pulls on nothing. No noise breaks ties, so that the loss is a function of its inputs.
+    - A pixel counts where the mask has its whole SSIM window: a window that reaches onto the ego
+      vehicle or the sky, which do not move, would say that the pixel does not either.
     - Out of view, the border's pixels stand in: black ones would reach into the view through SSIM's
       window and push the depth of the image's edge away.
     - The mean over scales, where the paper writes a sum (its public code: the mean).
@@ -75,6 +77,7 @@ def photometric_loss(
         transforms_BN44: take points from the target's camera to each context frame's.
         mask_BHW: bool, False on sky, ego vehicle and padding.
     """
+    inside_BHW = _erode(mask_BHW)
     error_of = PhotometricError(target_B3HW, ssim_weight)
     contexts = [frame_B3HW.contiguous() for frame_B3HW in context_BN3HW.unbind(1)]
     unwarped_BHW = None
@@ -95,6 +98,12 @@ def photometric_loss(
         error_BHW = torch.stack(errors).amin(0)
         if unwarped_BHW is not None:
             error_BHW = torch.where(error_BHW < unwarped_BHW, error_BHW, unwarped_BHW)
-        counts_BHW = torch.stack(valids).any(0) & mask_BHW
+        counts_BHW = torch.stack(valids).any(0) & inside_BHW
         total = total + error_BHW.masked_fill(~counts_BHW, 0).sum() / counts_BHW.sum().clamp(min=1)
     return total / len(inverse_SB1HW)
+
+
+def _erode(mask_BHW: Tensor) -> Tensor:
+    """True where the whole 3 x 3 neighbourhood inside the image is."""
+    outside = F.max_pool2d((~mask_BHW).float().unsqueeze(1), 3, stride=1, padding=1)
+    return outside.squeeze(1) == 0
