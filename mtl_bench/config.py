@@ -5,22 +5,20 @@ is a recipe with those three, the tasks and the video stage. Two cells with the 
 the same id, whatever file or option the values came from.
 """
 
-import dataclasses
 import hashlib
 import json
 import tomllib
-import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
-from types import MappingProxyType, UnionType
+from types import MappingProxyType
 from typing import Any
+
+from mtl_bench.plain import did_you_mean, from_dict, to_dict
 
 PROTOCOL = 1  # raised when numbers made before stop being comparable with numbers made after
 RECIPES = Path(__file__).parent / "recipes"
-T = typing.TypeVar("T")
 TASKS = ("panoptic", "depth")
 
 
@@ -61,6 +59,7 @@ class Network:
     head: int = 256  # hidden width of a head
     pose: str = "resnet18"  # pose encoder: resnet18 (the paper's) | light
     pose_channels: int = 256
+    pose_scale: tuple[float, float] = (0.01, 0.01)  # of translation, rotation
     min_depth: float = 0.5  # depth = 1 / (sigmoid / min_depth), arbitrary unit
     batch_norm_momentum: float = 0.01
 
@@ -74,7 +73,7 @@ class Loss:
     small_weight: float = 3.0
     center_sigma: float = 8.0  # pixels
     scales: tuple[int, ...] = (0, 1, 2)  # depth outputs in the photometric loss, 0 = finest
-    levels: tuple[int, ...] = (0,)  # image pyramid levels compared: (0,) the paper's, k = 1/2^k size
+    levels: tuple[int, ...] = (0,)  # of the images' pyramid, k = 1/2^k size; 0 the paper's
     automask: bool = True  # unwarped frames among the minimum's candidates
     ssim_weight: float = 0.85
 
@@ -162,18 +161,7 @@ class Cell:
         return f"{self.method}-{self.backbone}-s{self.seed}-{self.id}"
 
 
-# --- to and from plain values ---------------------------------------------------------------------
-
-
-def to_dict(value: Any) -> Any:
-    """Plain values of a (nested) dataclass, as JSON would hold them."""
-    if dataclasses.is_dataclass(value):
-        return {f.name: to_dict(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(k): to_dict(v) for k, v in sorted(value.items())}
-    if isinstance(value, (list, tuple)):
-        return [to_dict(v) for v in value]
-    return value
+# --- identity -----------------------------------------------------------------------------------
 
 
 def canonical_json(cell: Cell) -> str:
@@ -196,45 +184,6 @@ def _content_hash(weights: Path) -> str:
         raise ValueError(f"no weights file '{weights}'; --pretrained takes 'timm' or a file")
     with weights.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def from_dict(kind: type[T], values: Mapping[str, Any], where: str = "") -> T:
-    """Build a (nested) dataclass from plain values.
-
-    Raises:
-        ValueError: a key that the dataclass lacks, or a value of another type, with its full path.
-    """
-    types = typing.get_type_hints(kind)
-    fields = {f.name: types[f.name] for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    for key in values:
-        if key not in fields:
-            raise ValueError(f"unknown key '{where}{key}'{did_you_mean(key, fields)}")
-    return kind(**{k: _convert(fields[k], v, f"{where}{k}") for k, v in values.items()})
-
-
-def _convert(kind: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(kind):
-        if not isinstance(value, Mapping):
-            raise ValueError(f"'{where}' is a section, not the value {value!r}")
-        return from_dict(kind, value, f"{where}.")  # type: ignore[arg-type]
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (UnionType, typing.Union):
-        nothing = value == "none" and type(None) in args and str not in args
-        if value is None or nothing:
-            return None
-        return _convert(next(a for a in args if a is not type(None)), value, where)
-    if origin is tuple and isinstance(value, (list, tuple)):
-        inner = [args[0]] * len(value) if args[-1] is Ellipsis else args
-        if len(inner) == len(value):
-            return tuple(_convert(a, v, where) for a, v in zip(inner, value, strict=True))
-    elif origin is Mapping and isinstance(value, Mapping):
-        return MappingProxyType(dict(value))
-    elif kind is float and type(value) in (int, float):
-        return float(value)
-    elif type(value) is kind:
-        return value
-    name = getattr(kind, "__name__", str(kind)) if origin is None else str(kind)
-    raise ValueError(f"'{where}' must be {name}, not {value!r}")
 
 
 # --- recipes and overrides ------------------------------------------------------------------------
@@ -292,12 +241,3 @@ def _parse(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """` (did you mean 'x'?)`, or the known names where none is near."""
-    names = sorted(known)
-    near = get_close_matches(word, names, n=1)
-    if near:
-        return f" (did you mean '{near[0]}'?)"
-    return f" (known: {', '.join(names)})" if names else ""

@@ -10,11 +10,6 @@ from typing import Any, Protocol
 from mtl_bench.config import TASKS, Cell
 
 LINE_EVERY_S = 30.0
-HEADLINES = (  # metric, title, factor, digits
-    ("panoptic.pq", "PQ", 100.0, 1),
-    ("depth_median.abs_rel", "AbsRel", 1.0, 3),
-    ("latency.fps", "FPS", 1.0, 1),
-)
 
 
 @dataclass
@@ -177,13 +172,6 @@ def label(cell: Cell) -> str:
         for key, value in args.items()
     ]
     return " ".join(words)
-
-
-def headline(row: Mapping[str, Any]) -> str:
-    """The first numbers that one wants to see of a row."""
-    metric = row.get("metric", {})
-    known = [item for item in HEADLINES if isinstance(metric.get(item[0]), (int, float))]
-    return "  ".join(f"{title} {factor * metric[k]:.{n}f}" for k, title, factor, n in known)
 
 
 def duration(seconds: float) -> str:

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from mtl_bench import claim, results
 from mtl_bench.config import Cell, to_dict
-from mtl_bench.display import Display, Running, duration, headline
+from mtl_bench.display import Display, Running, duration
 from mtl_bench.provenance import cores
 
 CLAIMED = 75  # exit code of a cell that another process runs
@@ -163,7 +163,7 @@ class Launcher:
         self._states[job.cell.id] = state
         ok = state.word in ("done", "stale")
         word = state.word if ok else state.word.upper()
-        about = headline(state.row or {}) if ok else f"{state.why}  log: {job.directory}/log.txt"
+        about = state.headline if ok else f"{state.why}  log: {job.directory}/log.txt"
         words = [job.label, f"{word} {how}".strip(), duration(job.seconds), about]
         self.display.ended(job, "  ".join([*words, str(job.directory)] if ok else words), ok)
 

@@ -15,7 +15,7 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -26,6 +26,13 @@ from mtl_bench.config import Cell, from_dict, to_dict
 
 Word = Literal["done", "stale", "failed", "interrupted", "running", "missing"]
 WORDS: tuple[Word, ...] = get_args(Word)
+HEADLINES = (  # metric, title, digits
+    ("panoptic.pq", "PQ", 1),
+    ("semantic.miou", "mIoU", 1),
+    ("depth_median.rmse", "RMSE", 2),
+    ("depth_median.abs_rel", "AbsRel", 3),
+    ("latency.fps", "FPS", 1),
+)
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
 
 
@@ -34,6 +41,10 @@ class State:
     word: Word
     why: str = ""
     row: dict[str, Any] | None = None
+
+    @property
+    def headline(self) -> str:
+        return headline((self.row or {}).get("metric", {}))
 
 
 def run_dir(cell: Cell, runs: Path) -> Path:
@@ -149,6 +160,12 @@ def rows(cells: Iterable[Cell], runs: Path) -> list[dict[str, Any]]:
         }
         found.append({**blank, **(state.row or {}), "status": state.word, "error": state.why})
     return found
+
+
+def headline(metric: Mapping[str, Any]) -> str:
+    """The first numbers that one wants to see of a row's metrics."""
+    known = [item for item in HEADLINES if isinstance(metric.get(item[0]), (int, float))]
+    return "  ".join(f"{title} {metric[key]:.{digits}f}" for key, title, digits in known)
 
 
 # --- beginning and failing ------------------------------------------------------------------------

@@ -58,7 +58,7 @@ def run_cell(
         model, cell, root, engine.device, progress=lambda n, of: progress.update("evaluate", n, of)
     )
     eval_s = time.perf_counter() - start
-    echo(f"evaluated in {eval_s:.0f} s: {headline(evaluation.metrics)}")
+    echo(f"evaluated in {eval_s:.0f} s: {results.headline(evaluation.metrics)}")
     _save_samples(run_dir / "samples.npz", evaluation.samples)
 
     start = time.perf_counter()
@@ -133,17 +133,6 @@ def time_cell(model: Model, cell: Cell, root: Path, engine: Engine) -> dict[str,
         engine.device,
         engine.precision,
     )
-
-
-def headline(metrics: dict[str, Any]) -> str:
-    """The two or three numbers that a person wants first."""
-    parts = {
-        "PQ": "panoptic.pq",
-        "mIoU": "semantic.miou",
-        "RMSE": "depth_median.rmse",
-        "AbsRel": "depth_median.abs_rel",
-    }
-    return ", ".join(f"{n} {metrics[key]:.3g}" for n, key in parts.items() if key in metrics)
 
 
 def _save_samples(path: Path, samples: dict[str, Any]) -> None:

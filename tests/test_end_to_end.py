@@ -1,4 +1,4 @@
-"""The whole program as a person runs it: a grid, a method of one's own, a killed and repeated run."""
+"""The program as a person runs it: a grid, a method of one's own, a killed and repeated run."""
 
 import json
 import os

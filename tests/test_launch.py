@@ -11,7 +11,7 @@ import pytest
 
 from mtl_bench import claim, launch, provenance, results
 from mtl_bench.config import Cell, Recipe
-from mtl_bench.display import Lines, Running, duration, headline, label
+from mtl_bench.display import Lines, Running, duration, label
 
 FAKE = Path(__file__).with_name("fake_cell.py")
 
@@ -283,8 +283,8 @@ def test_labels_tell_cells_apart():
 
 def test_durations_and_headlines():
     assert [duration(s) for s in (12.4, 59.6, 250, 10950)] == ["12s", "1m00", "4m10", "3h02"]
-    assert headline({"metric": {"panoptic.pq": 0.341}}) == "PQ 34.1"
-    assert headline({}) == ""
+    assert results.headline({"panoptic.pq": 34.1}) == "PQ 34.1"
+    assert results.headline({}) == ""
 
 
 def test_expected_hours_come_from_the_cells_that_are_done(tmp_path):

@@ -17,7 +17,7 @@ LINES = 300
 
 # A module imports only from rooms before its own (or from its own).
 ORDER = (
-    *("config", "plugins", "provenance", "data", "geometry", "depth_scale"),
+    *("plain", "config", "plugins", "provenance", "data", "geometry", "depth_scale"),
     *("model", "postprocess", "losses", "method", "backward", "engine"),
     *("checkpoint", "curve", "progress", "tracking", "train"),
     *("metrics", "evaluate", "baselines", "export_predictions", "latency"),

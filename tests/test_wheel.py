@@ -30,7 +30,9 @@ def installed(tmp_path_factory) -> Path:
     (wheel,) = folder.glob("*.whl")
     pip = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check"]
     call(*pip, "install", "--quiet", "--no-deps", "--no-index", wheel)
-    site = Path(call(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
+    site = Path(
+        call(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip()
+    )
     # A path that a .pth file names is not searched for .pth files: the editable install stays out.
     (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
     return environment

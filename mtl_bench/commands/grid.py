@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -70,7 +72,8 @@ def ablate(
     from mtl_bench import launch
     from mtl_bench.plugins import check_cells
 
-    chosen = _load(grid, recipe, seeds, smoke, settings, pretrained)
+    choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
+    chosen = choice.load()
     check_cells(chosen.cells)
     todo = launch.to_run(chosen.cells, runs, rerun)
     for cell in [] if dry_run else todo:
@@ -84,7 +87,7 @@ def ablate(
     if todo:
         _run(todo, runs, data, options, jobs, rerun, quiet)
     _baseline(chosen, data, runs, quiet, refresh=bool(todo))
-    page = _write(chosen, runs, reports)
+    page = _write(chosen, runs, reports, choice.command)
     words = [row["status"] for row in _rows(chosen, runs)]
     bad = sum(word not in ("done", "stale") for word in words)
     if bad or not quiet:
@@ -105,13 +108,13 @@ def status(
 ) -> None:
     """List a grid's cells: done, stale, failed, interrupted, running or missing."""
     from mtl_bench import launch, results
-    from mtl_bench.display import headline, label
+    from mtl_bench.display import label
 
-    chosen = _load(grid, recipe, seeds, smoke, settings, pretrained)
+    chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
     lines = []
     for cell in chosen.cells:
         state = results.inspect(cell, runs)
-        about = "  ".join(filter(None, (state.why, headline(state.row or {}))))
+        about = "  ".join(filter(None, (state.why, state.headline)))
         lines.append([state.word, label(cell), str(results.run_dir(cell, runs)), about])
     for line in o.columns(lines):
         typer.echo(line)
@@ -129,38 +132,72 @@ def report(
     pretrained: o.PretrainedOption = None,
     runs: o.RunsOption = Path("runs"),
     reports: o.ReportsOption = Path("reports"),
+    readme: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Put the table between this file's <!-- results:GRID --> marks, too.",
+            show_default=False,
+        ),
+    ] = None,
     plugins: o.PluginsOption = None,
 ) -> None:
     """Write a grid's tables, plots and page from the rows that there are."""
-    chosen = _load(grid, recipe, seeds, smoke, settings, pretrained)
+    choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
+    chosen = choice.load()
     if not any("metric" in row for row in _rows(chosen, runs)):
         raise ValueError(
             f"no cell of grid '{chosen.name}' is done in '{runs}': mtl-bench ablate --grid {grid}"
         )
-    typer.echo(str(_write(chosen, runs, reports)))
+    page = _write(chosen, runs, reports, choice.command)
+    typer.echo(str(page))
+    if readme is not None:
+        from mtl_bench.report.readme import update
+
+        update(readme, chosen.name, page.parent)
+        typer.echo(str(readme))
 
 
 # --- steps ----------------------------------------------------------------------------------------
 
 
-def _load(
-    grid: str,
-    recipe: str | None,
-    seeds: int | None,
-    smoke: bool,
-    settings: list[str] | None,
-    pretrained: str | None,
-) -> "Grid":
-    from mtl_bench.grids import load_grid
+@dataclass(frozen=True)
+class Choice:
+    """What was said about which cells to take."""
 
-    return load_grid(
-        grid,
-        recipe=recipe,
-        seeds=seeds,
-        smoke=smoke,
-        settings=settings or [],
-        pretrained=o.weights(pretrained),
-    )
+    grid: str
+    recipe: str | None
+    seeds: int | None
+    smoke: bool
+    settings: list[str] | None
+    pretrained: str | None
+
+    def load(self) -> "Grid":
+        from mtl_bench.grids import load_grid
+
+        return load_grid(
+            self.grid,
+            recipe=self.recipe,
+            seeds=self.seeds,
+            smoke=self.smoke,
+            settings=self.settings or [],
+            pretrained=o.weights(self.pretrained),
+        )
+
+    @property
+    def command(self) -> str:
+        """How to run the same cells again; files without their folders."""
+        words = ["mtl-bench", "ablate", "--grid", Path(self.grid).name]
+        for option, value in (
+            ("--recipe", self.recipe and Path(self.recipe).name),
+            ("--seeds", self.seeds),
+            ("--pretrained", self.pretrained and Path(self.pretrained).name),
+        ):
+            words += [option, str(value)] if value is not None else []
+        words += ["--smoke"] * self.smoke
+        for setting in self.settings or []:
+            words += ["--set", setting]
+        return shlex.join(words)
 
 
 def _announce(grid: "Grid", todo: Sequence[Cell], runs: Path) -> None:
@@ -212,19 +249,18 @@ def _rows(grid: "Grid", runs: Path) -> list[dict[str, Any]]:
     return results.rows(grid.cells, runs)
 
 
-def _write(grid: "Grid", runs: Path, reports: Path) -> Path:
+def _write(grid: "Grid", runs: Path, reports: Path, command: str) -> Path:
     from mtl_bench import report as reporting
 
     file = _baseline_file(grid, runs)
     baseline = json.loads(file.read_text()) if file is not None and file.is_file() else None
-    command = f"mtl-bench ablate --grid {grid.name.removesuffix('-smoke')}"
     return reporting.build(
         grid,
         _rows(grid, runs),
         reports / grid.name,
         runs_root=runs,
         baseline=baseline,
-        command=command + (" --smoke" if grid.name.endswith("-smoke") else ""),
+        command=command,
     )
 
 

@@ -1,8 +1,8 @@
 """The label table: which classes exist, which are things, and how label ids become class indices.
 
-A *label id* is what Cityscapes writes into its files (7 = road). A *class index* is what the network
-predicts: contiguous, stuff before things. Source: Cityscapes' published label definitions; the
-20th training class `ego vehicle` and the order are MGNet's (class index 0, the rest shifted by one).
+A *label id* is what Cityscapes writes into its files (7 = road). A *class index* is what the
+network predicts: contiguous, stuff before things. Source: Cityscapes' published label definitions; the
+20th training class `ego vehicle` and the order (class index 0, the rest shifted) are MGNet's.
 """
 
 from dataclasses import dataclass
@@ -49,14 +49,14 @@ class LabelSet:
         return np.array([label.color for label in self.labels], np.uint8)
 
     def class_of_label_id(self) -> NDArray[np.uint8]:
-        """[256] look-up table from a file's label id to a class index, IGNORE where there is none."""
+        """[256] look-up table from a file's label id to a class index, or IGNORE."""
         table = np.full(256, IGNORE, np.uint8)
         for index, label in enumerate(self.labels):
             table[label.label_id] = index
         return table
 
     def label_id_of_class(self) -> NDArray[np.uint8]:
-        """[256] look-up table from a class index to the file's label id, 0 (unlabeled) for IGNORE."""
+        """[256] look-up table from a class index to the file's label id, 0 for IGNORE."""
         table = np.zeros(256, np.uint8)
         for index, label in enumerate(self.labels):
             table[index] = label.label_id

@@ -128,7 +128,9 @@ def build_model(cell: config.Cell, labels: LabelSet) -> Model:
     net = Network(backbone, sizes, len(labels), cell.tasks)
     pose = None
     if "depth" in cell.tasks:
-        pose = PoseNetwork(sizes.pose, sizes.pose_channels, pretrained=cell.pretrained == "timm")
+        pose = PoseNetwork(
+            sizes.pose, sizes.pose_channels, sizes.pose_scale, cell.pretrained == "timm"
+        )
     model = Model(net, pose)
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):

@@ -12,7 +12,6 @@ from pathlib import Path
 PICTURES = {
     "pq_fps": "Panoptic quality against frames per second",
     "rmse_fps": "Depth error against frames per second",
-    "samples": "Input, ground truth and predictions of each row",
 }
 
 

@@ -12,8 +12,8 @@ from mtl_bench.data.synthetic.material import Material, Patch
 PATCHES: dict[Material, tuple[Callable[[Patch], FloatArray], tuple[float, ...]]] = {
     Material.PLAIN: (grounds.plain, (0.1, 0.2, 0.25, 0.25, 0.2, 0.15)),
     Material.FACADE: (grounds.facade, (0.9, 0.75, 0.35, 0.25, 0.2, 0.2)),
-    Material.ASPHALT: (grounds.asphalt, (0.8, 1.2, 0.5, 0.35, 0.3, 0.25)),
-    Material.PAVING: (grounds.paving, (0.5, 0.9, 0.4, 0.3, 0.25, 0.2)),
+    Material.ASPHALT: (grounds.asphalt, (0.8, 1.2, 1.0, 0.6, 0.35, 0.25)),
+    Material.PAVING: (grounds.paving, (0.5, 0.9, 0.7, 0.4, 0.3, 0.2)),
     Material.GRASS: (grounds.grass, (0.5, 0.9, 0.6, 0.5, 0.45, 0.4)),
     Material.FOLIAGE: (grounds.foliage, (0.0, 0.4, 0.5, 0.6, 0.8, 0.8)),
     Material.SLATS: (grounds.slats, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
@@ -29,7 +29,7 @@ PATCHES: dict[Material, tuple[Callable[[Patch], FloatArray], tuple[float, ...]]]
     Material.ROOF: (grounds.roof, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
 }
 #: share of the street's direction in the noise: wear runs along the road, and a pixel is long there
-_STRETCH = {Material.ASPHALT: 0.35, Material.PAVING: 0.35, Material.GRASS: 0.35}
+_STRETCH = {Material.ASPHALT: 0.7, Material.PAVING: 0.7, Material.GRASS: 0.7}
 _STRETCH |= dict.fromkeys((Material.FACADE, Material.SLATS, Material.MASONRY), 0.6)
 #: width of the patterns' filter in pixels: wide where surfaces are large and pass close by, as
 #: whoever warps a frame interpolates between its pixels; narrow on small things, to keep their look
