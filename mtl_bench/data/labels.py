@@ -1,7 +1,7 @@
 """The label table: which classes exist, which are things, and how label ids become class indices.
 
 A *label id* is what Cityscapes writes into its files (7 = road). A *class index* is what the
-network predicts: contiguous, stuff before things. Source: Cityscapes' published label definitions; the
+network predicts: contiguous, stuff before things. Source: Cityscapes' label definitions; the
 20th training class `ego vehicle` and the order (class index 0, the rest shifted) are MGNet's.
 """
 

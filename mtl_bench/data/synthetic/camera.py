@@ -78,7 +78,7 @@ def draw_camera(rng: np.random.Generator, height: int, width: int) -> Camera:
 
 def draw_motion(rng: np.random.Generator, camera: Camera, frames: int, annotated: int) -> Motion:
     """Drive forward with nearly constant speed and turn rate; suspension adds some pitch."""
-    step_m, yaw_step = rng.uniform(0.45, 0.8), rng.normal(0, 0.0025)
+    step_m, yaw_step = rng.uniform(0.65, 1.1), rng.normal(0, 0.0025)
     heading, base_pitch = rng.normal(0, 0.015), rng.normal(0.012, 0.008)
     steps_m = step_m * (1 + rng.normal(0, 0.02, frames))
     yaws = heading + yaw_step * (np.arange(frames) - annotated) + rng.normal(0, 0.0004, frames)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mtl_bench.data.synthetic.camera import FloatArray
 
-WAVELENGTHS_M = (6.4, 2.3, 0.85, 0.32, 0.12, 0.045)
+WAVELENGTHS_M = (17.0, 6.4, 2.3, 0.85, 0.32, 0.12, 0.045)
 _PERIOD = 32  # lattice cells until the noise repeats
 _BITS = 5
 

@@ -8,25 +8,25 @@ from mtl_bench.data.synthetic import bodies, grounds
 from mtl_bench.data.synthetic.camera import FloatArray
 from mtl_bench.data.synthetic.material import Material, Patch
 
-#: function, noise strength per wavelength (6.4, 2.3, .85, .32, .12, .045 m)
+#: function, noise strength per wavelength (17, 6.4, 2.3, .85, .32, .12, .045 m)
 PATCHES: dict[Material, tuple[Callable[[Patch], FloatArray], tuple[float, ...]]] = {
-    Material.PLAIN: (grounds.plain, (0.1, 0.2, 0.25, 0.25, 0.2, 0.15)),
-    Material.FACADE: (grounds.facade, (0.9, 0.75, 0.35, 0.25, 0.2, 0.2)),
-    Material.ASPHALT: (grounds.asphalt, (0.8, 1.2, 1.0, 0.6, 0.35, 0.25)),
-    Material.PAVING: (grounds.paving, (0.5, 0.9, 0.7, 0.4, 0.3, 0.2)),
-    Material.GRASS: (grounds.grass, (0.5, 0.9, 0.6, 0.5, 0.45, 0.4)),
-    Material.FOLIAGE: (grounds.foliage, (0.0, 0.4, 0.5, 0.6, 0.8, 0.8)),
-    Material.SLATS: (grounds.slats, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
-    Material.MASONRY: (grounds.masonry, (0.35, 0.4, 0.4, 0.3, 0.25, 0.2)),
-    Material.BODY: (bodies.body, (0.0, 0.15, 0.2, 0.15, 0.1, 0.05)),
-    Material.CABIN: (bodies.cabin, (0.0, 0.15, 0.2, 0.15, 0.1, 0.05)),
-    Material.COACH: (bodies.coach, (0.1, 0.2, 0.22, 0.16, 0.1, 0.05)),
-    Material.SIGN: (bodies.sign, (0.0, 0.0, 0.06, 0.06, 0.05, 0.05)),
-    Material.LAMPS: (bodies.lamps, (0.0, 0.0, 0.06, 0.06, 0.05, 0.05)),
-    Material.PERSON: (bodies.person, (0.0, 0.1, 0.2, 0.25, 0.25, 0.15)),
-    Material.WHEEL: (bodies.wheel, (0.0, 0.0, 0.1, 0.1, 0.1, 0.1)),
-    Material.HEAD: (bodies.head, (0.0, 0.0, 0.05, 0.05, 0.05, 0.05)),
-    Material.ROOF: (grounds.roof, (0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
+    Material.PLAIN: (grounds.plain, (0.0, 0.1, 0.2, 0.25, 0.25, 0.2, 0.15)),
+    Material.FACADE: (grounds.facade, (0.6, 0.9, 0.75, 0.35, 0.25, 0.2, 0.2)),
+    Material.ASPHALT: (grounds.asphalt, (1.0, 1.1, 1.3, 1.0, 0.6, 0.35, 0.25)),
+    Material.PAVING: (grounds.paving, (0.8, 0.5, 0.9, 0.7, 0.4, 0.3, 0.2)),
+    Material.GRASS: (grounds.grass, (0.8, 0.5, 0.9, 0.6, 0.5, 0.45, 0.4)),
+    Material.FOLIAGE: (grounds.foliage, (0.0, 0.0, 0.4, 0.5, 0.6, 0.8, 0.8)),
+    Material.SLATS: (grounds.slats, (0.0, 0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
+    Material.MASONRY: (grounds.masonry, (0.0, 0.35, 0.4, 0.4, 0.3, 0.25, 0.2)),
+    Material.BODY: (bodies.body, (0.0, 0.0, 0.15, 0.2, 0.15, 0.1, 0.05)),
+    Material.CABIN: (bodies.cabin, (0.0, 0.0, 0.15, 0.2, 0.15, 0.1, 0.05)),
+    Material.COACH: (bodies.coach, (0.0, 0.1, 0.2, 0.22, 0.16, 0.1, 0.05)),
+    Material.SIGN: (bodies.sign, (0.0, 0.0, 0.0, 0.06, 0.06, 0.05, 0.05)),
+    Material.LAMPS: (bodies.lamps, (0.0, 0.0, 0.0, 0.06, 0.06, 0.05, 0.05)),
+    Material.PERSON: (bodies.person, (0.0, 0.0, 0.1, 0.2, 0.25, 0.25, 0.15)),
+    Material.WHEEL: (bodies.wheel, (0.0, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1)),
+    Material.HEAD: (bodies.head, (0.0, 0.0, 0.0, 0.05, 0.05, 0.05, 0.05)),
+    Material.ROOF: (grounds.roof, (0.0, 0.25, 0.3, 0.3, 0.25, 0.2, 0.15)),
 }
 #: share of the street's direction in the noise: wear runs along the road, and a pixel is long there
 _STRETCH = {Material.ASPHALT: 0.7, Material.PAVING: 0.7, Material.GRASS: 0.7}
