@@ -25,7 +25,7 @@ def dgc_scale(
     K_B33: Tensor,
     camera_height_m_B: Tensor,
     road_BHW: Tensor | None,
-    max_tilt: float = MAX_TILT,
+    max_tilt: float = 0.0,
     pitch_rad_B: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Factor [B] from depth to metres, and where it came from [B] (an index into DGC_SOURCES).
@@ -37,17 +37,19 @@ def dgc_scale(
 
     Departs from the paper in the normal n. Its normals come from neighbouring pixels of each point
     and are biased by noise (5 % of noise shift the height by a tenth or more), least squares on
-    n . X = 1 likewise. Here n is one for the image: a level camera's (0, 1, 0), tilted as far as
-    the ground's inverse depth says (linear in the pixel for a plane, so that noise averages out),
-    but at most by `max_tilt`. Exact on a plane within that tilt. Only pixels well below the optical
-    axis count (BELOW_HORIZON): near the horizon a small tilt changes the height many times over.
+    n . X = 1 likewise. Here n is one for the image: straight down by the camera's calibrated pitch.
+    With `max_tilt` it is tilted further, as far as the ground's inverse depth says (linear in the
+    pixel for a plane, so that noise averages out): exact on a plane within that tilt where the
+    pitch is not known, but a prediction that bends the road pulls it off, so it is off by default.
+    Only pixels well below the optical axis count (BELOW_HORIZON): near the horizon a small tilt
+    changes the height many times over.
 
     Args:
         depth_B1HW: any unit.
         K_B33: intrinsics in pixels of that map.
         camera_height_m_B: above the road.
         road_BHW: bool, predicted; None without a panoptic task.
-        max_tilt: tangent of the largest pitch and roll to look for; 0 = none.
+        max_tilt: tangent of the largest pitch and roll to look for; 0 = none; try MAX_TILT.
         pitch_rad_B: the calibrated pitch to start from, positive looks down; None = level.
     """
     step = math.ceil(math.sqrt(depth_B1HW.shape[2] * depth_B1HW.shape[3] / GRID))

@@ -94,7 +94,11 @@ def predict(
         if not depth_B1HW.isfinite().all():
             raise ValueError(f"the predicted depth is not finite in a frame of {batch.names}")
         result.dgc_scale_B, result.dgc_source_B = postprocess.dgc_scale(
-            depth_B1HW, batch.K_B33, batch.camera_height_m_B, road_BHW
+            depth_B1HW,
+            batch.K_B33,
+            batch.camera_height_m_B,
+            road_BHW,
+            pitch_rad_B=batch.camera_pitch_rad_B,
         )
     if size != tuple(batch.image_B3HW.shape[2:]):
         outputs = postprocess.resize(outputs, *size)

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from mtl_bench import provenance, results
+from mtl_bench import checkpoint, provenance, results
 from mtl_bench.config import Cell, to_dict
 from mtl_bench.curve import training_time
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.engine import Engine, choose_device
 from mtl_bench.evaluate import Evaluation, evaluate
+from mtl_bench.export_predictions import export_predictions
 from mtl_bench.latency import measure
 from mtl_bench.model import Model
 from mtl_bench.progress import Progress
@@ -92,11 +93,23 @@ def run_cell(
 
 
 def reevaluate(
-    cell: Cell, checkpoint_path: Path, root: Path, device: str = "auto", split: str | None = None
+    cell: Cell,
+    checkpoint_path: Path,
+    root: Path,
+    device: str = "auto",
+    split: str | None = None,
+    export: Path | None = None,
 ) -> Evaluation:
-    """Evaluate a stored checkpoint again, on any split; writes nothing."""
+    """Evaluate a stored checkpoint again, on any split.
+
+    Args:
+        export: folder for the panoptic predictions, in Cityscapes' format.
+    """
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
-    return evaluate(load_model(cell, checkpoint_path, engine), cell, root, engine.device, split)
+    model = load_model(cell, checkpoint_path, engine)
+    if export is not None:
+        export_predictions(model, cell, root, export, engine.device, split)
+    return evaluate(model, cell, root, engine.device, split)
 
 
 def load_model(cell: Cell, path: Path, engine: Engine, labels: LabelSet = LABELS) -> Model:
@@ -105,8 +118,6 @@ def load_model(cell: Cell, path: Path, engine: Engine, labels: LabelSet = LABELS
     Raises:
         ValueError: no readable checkpoint there, or one of another model.
     """
-    from mtl_bench import checkpoint
-
     state = checkpoint.read(path)
     model = build(cell, labels, engine)[0]
     try:

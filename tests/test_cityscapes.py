@@ -61,6 +61,7 @@ def test_training_sample_without_changes_shows_the_files(tree):
         sample.K_B33, torch.tensor([[2262.52, 0, 16.98], [0, 2265.3, 8.137], [0, 0, 1]])
     )
     assert sample.camera_height_m_B.item() == pytest.approx(1.22)
+    assert sample.camera_pitch_rad_B.item() == pytest.approx(0.038)
     assert sample.instance_ids_BHW is None
     assert sample.depth_m_BHW is None
 

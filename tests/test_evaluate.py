@@ -57,7 +57,7 @@ def root(tmp_path_factory):
     """Frames of one gray level each, by which the models recognise them; train is almost val."""
     root = tmp_path_factory.mktemp("tree")
     camera = {
-        "extrinsic": {"baseline": BASELINE, "z": CAMERA_M},
+        "extrinsic": {"baseline": BASELINE, "z": CAMERA_M, "pitch": 0.0},
         "intrinsic": {"fx": FOCAL, "fy": FOCAL, "u0": (WIDTH - 1) / 2, "v0": (HEIGHT - 1) / 2},
     }
     for split in ("train", "val"):

@@ -198,7 +198,9 @@ def plane(camera_m=1.4, pitch=0.0, roll=0.0, height=HEIGHT, width=WIDTH):
 @pytest.mark.parametrize("size", [(64, 128), (400, 900)], ids=["small", "subsampled"])
 def test_scale_is_exact_on_a_plane(pitch, roll, size):
     depth, K, road = plane(pitch=pitch, roll=roll, height=size[0], width=size[1])
-    scale, source = postprocess.dgc_scale(depth / 3.3, K, torch.tensor([1.4]), road)
+    scale, source = postprocess.dgc_scale(
+        depth / 3.3, K, torch.tensor([1.4]), road, max_tilt=depth_scale.MAX_TILT
+    )
     assert source.tolist() == [postprocess.ROAD]
     assert scale.item() == pytest.approx(3.3, rel=1e-4)
 
@@ -211,14 +213,19 @@ def test_a_known_pitch_needs_no_search():
             depth / 2, K, torch.tensor([1.4]), road, max_tilt=max_tilt, pitch_rad_B=pitch
         )
         assert scale.item() == pytest.approx(2.0, rel=1e-4)
-    unknown, _ = postprocess.dgc_scale(depth / 2, K, torch.tensor([1.4]), road, max_tilt=0.0)
+    unknown, _ = postprocess.dgc_scale(depth / 2, K, torch.tensor([1.4]), road)
     assert unknown.item() > 2.4
 
 
 def test_a_pitch_that_is_off_is_corrected():
     depth, K, road = plane(pitch=0.05, roll=0.02)
     scale, _ = postprocess.dgc_scale(
-        depth, K, torch.tensor([1.4]), road, pitch_rad_B=torch.tensor([0.03])
+        depth,
+        K,
+        torch.tensor([1.4]),
+        road,
+        max_tilt=depth_scale.MAX_TILT,
+        pitch_rad_B=torch.tensor([0.03]),
     )
     assert scale.item() == pytest.approx(1.0, rel=1e-4)
 
@@ -227,7 +234,9 @@ def test_scale_without_a_road_comes_from_horizontal_surfaces():
     depth, K, _ = plane(pitch=0.03)
     depth[..., :, 90:] = 9.0  # a wall that faces the camera
     for road in (None, torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)):
-        scale, source = postprocess.dgc_scale(depth / 0.7, K, torch.tensor([1.4]), road)
+        scale, source = postprocess.dgc_scale(
+            depth / 0.7, K, torch.tensor([1.4]), road, max_tilt=depth_scale.MAX_TILT
+        )
         assert source.tolist() == [postprocess.NORMALS]
         assert scale.item() == pytest.approx(0.7, rel=1e-4)
 
@@ -250,12 +259,12 @@ def test_noise_and_wrong_road_pixels_move_the_scale_little():
     generator = torch.Generator().manual_seed(0)
     noisy = depth * (1 + 0.1 * torch.randn(depth.shape, generator=generator))
     height = torch.full((20,), 1.4)
-    scale, _ = postprocess.dgc_scale(noisy, K, height, road)
+    scale, _ = postprocess.dgc_scale(noisy, K, height, road, max_tilt=depth_scale.MAX_TILT)
     assert scale.mean().item() == pytest.approx(1.0, abs=0.02)
     assert scale.std().item() < 0.03
 
     noisy[..., 40:56, 10:40] *= 0.6  # a car that was taken for road
-    scale, _ = postprocess.dgc_scale(noisy, K, height, road)
+    scale, _ = postprocess.dgc_scale(noisy, K, height, road, max_tilt=depth_scale.MAX_TILT)
     assert scale.mean().item() == pytest.approx(1.0, abs=0.1)
 
 
@@ -263,7 +272,7 @@ def test_a_bend_of_the_depth_cannot_tilt_the_camera_far():
     depth, K, road = plane()
     bent = depth**0.5  # nothing like a plane
     height = torch.tensor([1.4])
-    free, _ = postprocess.dgc_scale(bent, K, height, road)
-    level, _ = postprocess.dgc_scale(bent, K, height, road, max_tilt=0.0)
+    free, _ = postprocess.dgc_scale(bent, K, height, road, max_tilt=depth_scale.MAX_TILT)
+    level, _ = postprocess.dgc_scale(bent, K, height, road)
     lowest_ray = depth_scale.BELOW_HORIZON * (HEIGHT - 1) / 2 / FOCAL
     assert level.item() / (1 + depth_scale.MAX_TILT / lowest_ray) < free.item() < level.item()

@@ -135,6 +135,15 @@ def evaluate(
         str | None,
         typer.Option(metavar="NAME", help="In place of the recipe's.", show_default=False),
     ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Write the panoptic predictions there, too, as Cityscapes' evaluator "
+            "(csEvalPanopticSemanticLabeling) reads them.",
+            show_default=False,
+        ),
+    ] = None,
     data: o.DataOption = None,
     device: o.DeviceOption = o.Device.auto,
     plugins: o.PluginsOption = None,
@@ -149,5 +158,5 @@ def evaluate(
     root = o.data_root(cell, data)
     from mtl_bench.run import reevaluate
 
-    evaluation = reevaluate(cell, checkpoint, root, device.value, split)
+    evaluation = reevaluate(cell, checkpoint, root, device.value, split, export)
     typer.echo(json.dumps(evaluation.metrics, indent=1))

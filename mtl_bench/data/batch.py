@@ -20,6 +20,7 @@ class Batch:
     image_B3HW: Tensor  # what the network sees: colour-jittered in training
     K_B33: Tensor  # intrinsics in pixels of image_B3HW
     camera_height_m_B: Tensor
+    camera_pitch_rad_B: Tensor  # to the ground, positive looks down
 
     # Video, absent where no task asks for it. Order: previous, next.
     context_BN3HW: Tensor | None = None  # jittered like the image: the pose network's input

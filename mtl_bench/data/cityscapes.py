@@ -36,6 +36,7 @@ class _Frame:
     images_N3HW: Tensor  # uint8, input size; in training followed by previous and next
     K_33: Tensor
     camera_height_m: float
+    camera_pitch_rad: float
     instance_ids: Tensor | None  # int32; input size in training, own size in evaluation
     depth_m: Tensor | None
 
@@ -124,6 +125,7 @@ class Cityscapes:
             image_B3HW=frame.images_N3HW[0].float() / 255,
             K_B33=frame.K_33,
             camera_height_m_B=torch.tensor(frame.camera_height_m),
+            camera_pitch_rad_B=torch.tensor(frame.camera_pitch_rad),
             instance_ids_BHW=frame.instance_ids,
             depth_m_BHW=frame.depth_m,
         )
@@ -138,6 +140,7 @@ class Cityscapes:
             image_B3HW=view.jittered_N3HW[0],
             K_B33=view.K_33,
             camera_height_m_B=torch.tensor(frame.camera_height_m),
+            camera_pitch_rad_B=torch.tensor(frame.camera_pitch_rad),
         )
         if self.video:
             batch.context_BN3HW = view.jittered_N3HW[1:]
@@ -185,6 +188,7 @@ class Cityscapes:
             images_N3HW=torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous(),
             K_33=scale(K, self.data.width / own_size[1], self.data.height / own_size[0]),
             camera_height_m=camera.height_m,
+            camera_pitch_rad=camera.pitch_rad,
             instance_ids=None if ids is None else torch.from_numpy(ids.astype(np.int32)),
             depth_m=None if depth_m is None else torch.from_numpy(depth_m),
         )

@@ -115,22 +115,23 @@ class Camera:
     v0: float
     baseline_m: float  # between the stereo pair
     height_m: float  # above the ground
+    pitch_rad: float  # positive looks down
 
 
 def read_camera(path: Path) -> Camera:
-    """A frame's own camera file: the extrinsic z is the height above the ground."""
+    """A frame's own camera file: its extrinsics are in the vehicle's axes, on the ground."""
     try:
         values = json.loads(path.read_text())
         intrinsic, extrinsic = values["intrinsic"], values["extrinsic"]
         focal_and_center = [float(intrinsic[key]) for key in ("fx", "fy", "u0", "v0")]
-        distances = [float(extrinsic[key]) for key in ("baseline", "z")]
+        mounting = [float(extrinsic[key]) for key in ("baseline", "z", "pitch")]
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
     except KeyError as error:
         raise ValueError(f"{path}: no {error} in this camera file") from error
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: not a camera file ({error})") from error
-    camera = Camera(*focal_and_center, *distances)
+    camera = Camera(*focal_and_center, *mounting)
     if not (all(map(math.isfinite, vars(camera).values())) and min(camera.fx, camera.fy) > 0):
         raise ValueError(f"{path}: impossible camera {camera}")
     return camera
