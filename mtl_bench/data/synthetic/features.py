@@ -124,9 +124,9 @@ def _large(make: Callable[[np.random.Generator], v.Vehicle]) -> Callable:
         if kind < 0.85:
             x = -street.right.lane_edge - made.width / 2 - rng.uniform(0.2, 0.5)
             return crowd.vehicle(made, x, z, np.pi, rng.uniform(0.3, 0.6) * (rng.random() < 0.3))
-        return crowd.vehicle(
-            made, rng.normal(0, 0.1), z + 3, 0.0, crowd.ego_step_m * rng.uniform(0.8, 1.2)
-        )
+        # what drives as fast as we do looks infinitely far; most stand in a queue
+        pace = rng.uniform(0.8, 1.2) * (rng.random() < 0.2)
+        return crowd.vehicle(made, rng.normal(0, 0.1), z + 3, 0.0, crowd.ego_step_m * pace)
 
     return feature
 

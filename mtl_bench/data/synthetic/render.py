@@ -29,7 +29,7 @@ from mtl_bench.data.synthetic.primitives import (
     unit_normals,
 )
 
-RENDERER_VERSION = 4  # raised with every change of what is drawn
+RENDERER_VERSION = 5  # raised with every change of what is drawn
 EGO, SKY = 1, 23
 _DIVISOR = 1000
 

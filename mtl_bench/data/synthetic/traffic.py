@@ -38,9 +38,9 @@ def _moving(rng: np.random.Generator, crowd: Crowd) -> None:
     if street.tram_x is not None and rng.random() < 0.9:
         tram = v.tram(rng)
         z, away = rng.uniform(9, 28) + tram.length / 2, rng.random() < 0.4
-        speed = 0.0 if rng.random() < 0.55 else rng.uniform(0.2, 0.6)
+        speed = 0.0 if rng.random() < 0.7 else rng.uniform(0.2, 0.6)
         crowd.vehicle(tram, street.tram_x, z, 0.0 if away else np.pi, speed)
-    if rng.random() < 0.3:
+    if rng.random() < 0.1:
         speed = crowd.ego_step_m * rng.uniform(0.85, 1.2)
         crowd.vehicle(
             v.car(rng), rng.normal(0, 0.15), rng.uniform(11, 32), rng.normal(0, 0.01), speed
