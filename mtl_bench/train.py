@@ -44,6 +44,7 @@ def train(
     """
     optim = cell.recipe.optim
     model, method, optimizer = build(cell, labels, engine)
+    torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
     path, step = run_dir / CHECKPOINT, 0
     if path.is_file():
         state = checkpoint.read(path)

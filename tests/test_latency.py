@@ -159,7 +159,8 @@ def test_peak_includes_weights_and_grows_with_the_image():
     weights_mib = (CLASSES + 4) * 3 * 9 * 4 / latency.MIB
     maps_mib = (CLASSES + 4) * HEIGHT * WIDTH * 4 / latency.MIB
     assert small["latency.peak_mib"] > weights_mib + maps_mib
-    assert large["latency.peak_mib"] > 3.8 * small["latency.peak_mib"]
+    # four times the maps; the depth's scale looks at a number of pixels that does not grow
+    assert large["latency.peak_mib"] > 2 * small["latency.peak_mib"]
 
 
 def test_distinct_images_reach_the_network_as_they_are():
@@ -179,7 +180,7 @@ def test_every_form_of_image_is_the_same_image(kind):
     forms = {
         "uint8": image.to(torch.uint8),
         "float": image / 255,
-        "batch": Batch(["a"], image[None] / 255, K_33[None], torch.tensor([1.4])),
+        "batch": Batch(["a"], image[None] / 255, K_33[None], torch.tensor([1.4]), torch.zeros(1)),
     }
     model = FakeModel()
     measure(model, given=[forms[kind]])
