@@ -1,0 +1,64 @@
+"""The light pose encoder's flow is the shift that the images have, and its network starts still."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from mtl_bench.model.pose import FlowEncoder, PoseNetwork
+
+
+def picture(height: int = 64, width: int = 128) -> torch.Tensor:
+    """Smooth random texture [1,3,H,W], wider than any shift in these tests."""
+    torch.manual_seed(0)
+    coarse = torch.rand(1, 3, height // 8, width // 8)
+    return F.interpolate(coarse, (height, width), mode="bicubic", align_corners=False).clamp(0, 1)
+
+
+def shifted(image: torch.Tensor, right: float, down: float) -> torch.Tensor:
+    """What was at (x, y) is at (x + right, y + down)."""
+    height, width = image.shape[2:]
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    at = torch.stack([(x - right) / (width - 1), (y - down) / (height - 1)], -1) * 2 - 1
+    return F.grid_sample(image, at[None].float(), align_corners=True, padding_mode="border")
+
+
+@pytest.mark.parametrize("level", FlowEncoder.LEVELS)
+@pytest.mark.parametrize(("right", "down"), [(0.4, 0.0), (0.0, -0.7), (1.0, 0.5)])
+def test_flow_is_the_shift(level, right, down):
+    image = picture()
+    context = torch.stack([shifted(image, right, down), shifted(image, -right, -down)], 1)
+    encoder = FlowEncoder(8)
+    target, frames = image.mean(1, keepdim=True), context.mean(2)
+    flow = encoder._flow(target, frames, level)[:, :4, 2:-2, 2:-2] * encoder.CELL
+    assert flow.shape[1:] == (4, 4, 12)
+    expected = torch.tensor([right, -right, down, -down])
+    torch.testing.assert_close(
+        flow.median(2).values.median(2).values[0], expected, atol=0.12, rtol=0.2
+    )
+
+
+def test_nothing_to_see_is_no_flow():
+    plain = torch.full((2, 3, 64, 128), 0.5)
+    features = FlowEncoder(8).eval()(plain, plain[:, None].expand(-1, 2, -1, -1, -1))
+    assert features.isfinite().all()
+
+
+@pytest.mark.parametrize("encoder", ["light", "resnet18"])
+def test_poses_follow_the_scales(encoder):
+    image = picture().repeat(2, 1, 1, 1)
+    context = torch.stack([shifted(image[:1], 1, 0), shifted(image[:1], -1, 0)], 1).repeat(
+        2, 1, 1, 1, 1
+    )
+    torch.manual_seed(0)
+    still = PoseNetwork(encoder, 16, scale=(0.0, 0.0)).eval()
+    moving = PoseNetwork(encoder, 16, scale=(0.0, 1.0)).eval()
+    moving.load_state_dict(still.state_dict())
+    assert torch.equal(still(image, context), torch.eye(4).expand(2, 2, 4, 4))
+    transforms = moving(image, context)
+    assert (transforms[..., :3, 3] == 0).all()
+    assert (transforms[..., :3, :3] - torch.eye(3)).abs().max() > 1e-3
+
+
+def test_unknown_encoder():
+    with pytest.raises(ValueError, match="no pose encoder 'big'"):
+        PoseNetwork("big")
