@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from mtl_bench.config import Cell, Network, Recipe
+from mtl_bench.config import Cell, Network, Recipe, load_recipe, recipe_names
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.engine import initial_weights
 from mtl_bench.model import build_model
@@ -140,3 +140,14 @@ def test_weights_file_is_loaded(tmp_path):
     cell = replace(PAPER, backbone="mnasnet", pretrained=str(path), tasks=("panoptic",))
     backbone = build_model(cell, CITYSCAPES20).net.backbone
     assert torch.equal(backbone.pyramid.conv_stem.weight, reference.conv_stem.weight)
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_every_recipe_builds(name):
+    cell = Cell(load_recipe(name), backbone="resnet18", method="fixed")
+    assert count(build_model(cell, CITYSCAPES20)) > 10_000
+
+
+def test_the_cityscapes_recipe_is_the_papers_network():
+    model = build_model(replace(PAPER, recipe=load_recipe("cityscapes")), CITYSCAPES20)
+    assert inference_count(model) == 17_843_008

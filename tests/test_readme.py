@@ -28,3 +28,13 @@ def test_example_passes_the_checks(kind, name, marker, tmp_path, monkeypatch):
 def test_every_linked_file_exists():
     for target in re.findall(r"\]\((?!http)([^)#]+)\)", README.read_text()):
         assert (README.parent / target).exists(), target
+
+
+def test_the_results_are_the_reference_reports(tmp_path):
+    report = README.parent / "reports" / "backbones"
+    table = (report / "table.md").read_text(encoding="utf-8").rstrip("\n")
+    section = re.search(
+        r"<!-- results:backbones -->\n(.*?)<!-- /results -->", README.read_text("utf-8"), re.DOTALL
+    )
+    assert section is not None
+    assert section[1].startswith(table)
