@@ -68,23 +68,12 @@ def run_cell(
     echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
 
     row = {
-        "cell_id": cell.id,
-        "slug": cell.slug,
-        "status": "done",
-        "method": cell.method,
-        "backbone": cell.backbone,
-        "tasks": list(cell.tasks),
-        "seed": cell.seed,
-        "video": cell.video,
-        "pretrained": cell.pretrained,
-        "recipe": cell.recipe.name,
-        "smoke": cell.recipe.smoke,
+        **_identity(cell),
         "metric": {**evaluation.metrics, **timing},
         "protocol": evaluation.protocol,
         "time": {"train_s": train_s, "step_ms": step_ms, "eval_s": eval_s, "latency_s": latency_s},
         "code": provenance.code(cell),
         "env": environment,
-        "cell": to_dict(cell),
     }
     tracker.log({key: value for key, value in row["metric"].items() if not isinstance(value, str)})
     tracker.finish()
@@ -144,6 +133,27 @@ def time_cell(model: Model, cell: Cell, root: Path, engine: Engine) -> dict[str,
         engine.device,
         engine.precision,
     )
+
+
+def _identity(cell: Cell) -> dict[str, Any]:
+    """What a row says of its cell; rows travel, so a weights file goes without its folder."""
+    values = to_dict(cell)
+    if cell.pretrained is not None:
+        values["pretrained"] = Path(cell.pretrained).name
+    return {
+        "cell_id": cell.id,
+        "slug": cell.slug,
+        "status": "done",
+        "method": cell.method,
+        "backbone": cell.backbone,
+        "tasks": list(cell.tasks),
+        "seed": cell.seed,
+        "video": cell.video,
+        "pretrained": values["pretrained"],
+        "recipe": cell.recipe.name,
+        "smoke": cell.recipe.smoke,
+        "cell": values,
+    }
 
 
 def _save_samples(path: Path, samples: dict[str, Any]) -> None:

@@ -7,10 +7,10 @@ import torch.nn.functional as F
 from mtl_bench.model.pose import FlowEncoder, PoseNetwork
 
 
-def picture(height: int = 64, width: int = 128) -> torch.Tensor:
-    """Smooth random texture [1,3,H,W], wider than any shift in these tests."""
+def picture(height: int = 64, width: int = 128, grain: int = 8) -> torch.Tensor:
+    """Smooth random texture [1,3,H,W], `grain` pixels wide."""
     torch.manual_seed(0)
-    coarse = torch.rand(1, 3, height // 8, width // 8)
+    coarse = torch.rand(1, 3, height // grain, width // grain)
     return F.interpolate(coarse, (height, width), mode="bicubic", align_corners=False).clamp(0, 1)
 
 
@@ -25,12 +25,12 @@ def shifted(image: torch.Tensor, right: float, down: float) -> torch.Tensor:
 @pytest.mark.parametrize("level", FlowEncoder.LEVELS)
 @pytest.mark.parametrize(("right", "down"), [(0.4, 0.0), (0.0, -0.7), (1.0, 0.5)])
 def test_flow_is_the_shift(level, right, down):
-    image = picture()
+    image = picture(256, 512, 4 * 2**level)  # what this level is there to see
     context = torch.stack([shifted(image, right, down), shifted(image, -right, -down)], 1)
     encoder = FlowEncoder(8)
     target, frames = image.mean(1, keepdim=True), context.mean(2)
-    flow = encoder._flow(target, frames, level)[:, :4, 2:-2, 2:-2] * encoder.CELL
-    assert flow.shape[1:] == (4, 4, 12)
+    flow = encoder._flow(target, frames, level)[:, :4, 4:-4, 4:-4] * encoder.CELL
+    assert flow.shape[1:] == (4, 24, 56)
     expected = torch.tensor([right, -right, down, -down])
     torch.testing.assert_close(
         flow.median(2).values.median(2).values[0], expected, atol=0.12, rtol=0.2
