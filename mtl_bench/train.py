@@ -59,8 +59,8 @@ def train(
     model.train()
 
     def save() -> None:
+        curve.flush()  # first: the rows up to a checkpoint's step must never be missing
         checkpoint.save(path, step, model, method, optimizer, engine.scaler)
-        curve.flush()
 
     with Curve(run_dir / "curve.csv", step) as curve:
         while step < optim.steps:

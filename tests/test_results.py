@@ -197,8 +197,8 @@ def test_half_written_claim_counts_for_a_moment(directory):
 
 
 def test_command_line_names_no_place_of_this_machine():
-    argv = ["/home/someone/bin/mtl-bench", "train", "runs/x/cell.json", "--data", "/mnt/cs"]
-    argv += ["--plugins=/home/someone/mine", "--set", "recipe.optim.lr=3e-4", "../someone/a.toml"]
+    argv = ["/opt/someone/bin/mtl-bench", "train", "runs/x/cell.json", "--data", "/mnt/cs"]
+    argv += ["--plugins=/opt/someone/mine", "--set", "recipe.optim.lr=3e-4", "../someone/a.toml"]
     assert provenance.command_line(argv) == (
         "mtl-bench train runs/x/cell.json --data cs --plugins=mine "
         "--set recipe.optim.lr=3e-4 a.toml"

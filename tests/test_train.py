@@ -1,6 +1,7 @@
 """The loop: it learns, it stops on nonsense, and a killed run ends as if it had not been killed."""
 
 import csv
+import shutil
 import signal
 import subprocess
 import sys
@@ -110,6 +111,25 @@ def test_a_request_to_stop_saves_and_the_run_goes_on(smoke_cell, smoke_root, tmp
         run(smoke_cell, smoke_root, stopped, Asked(stopped, print))
     run(smoke_cell, smoke_root, stopped)
     assert_same_state(tmp_path / "straight", stopped)
+
+
+def test_killed_just_after_a_checkpoint_the_curve_has_every_step(
+    smoke_cell, smoke_root, tmp_path, monkeypatch
+):
+    """What is on disk at the moment the checkpoint is complete is all that a resumed run gets."""
+    save, on_disk = checkpoint.save, tmp_path / "as_killed"
+
+    def save_and_copy(path, step, *state):
+        save(path, step, *state)
+        if step == 3:
+            shutil.copytree(path.parent, on_disk)
+
+    monkeypatch.setattr(checkpoint, "save", save_and_copy)
+    run(smoke_cell, smoke_root, tmp_path / "straight")
+    monkeypatch.undo()
+    run(smoke_cell, smoke_root, on_disk)
+    with (on_disk / "curve.csv").open() as file:
+        assert [int(row["step"]) for row in csv.DictReader(file)] == [1, 2, 3, 4, 5, 6]
 
 
 def test_seeds_differ_and_a_seed_repeats(smoke_cell, smoke_root, tmp_path):
