@@ -1,16 +1,53 @@
 """Constant weights, the paper's by default: the baseline that every method has to beat.
 
 Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021), section 3.2: semantic 1, center 200,
-offset 0.01, photometric 1, smoothness 0.001, after Panoptic-DeepLab and Monodepth2.
+offset 0.01, photometric 1, smoothness 0.001, after Panoptic-DeepLab and Monodepth2. With prior =
+"equal" it is equal weighting: the plain sum, which some public code divides by the number of terms.
 """
 
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import torch
 from torch import Tensor
 
+from mtl_bench.losses.terms import TASK_KINDS, TERMS, Term
 from mtl_bench.method import LossMethod
+from mtl_bench.plain import did_you_mean
+
+PRIORS = ("paper", "equal")
 
 
 class Fixed(LossMethod):
-    """sum_i w_i L_i"""
+    """sum_i w_i L_i
 
-    def total(self, loss_T: Tensor) -> Tensor:
-        return (self.fixed_T * loss_T).sum()
+    Args:
+        prior: "paper" (the weights above) or "equal" (all 1).
+        weights: replace single ones, by the name of a loss term or task.
+
+    Raises:
+        ValueError: an unknown prior or name.
+    """
+
+    weight_T: Tensor
+
+    def __init__(
+        self,
+        terms: Sequence[Term],
+        seed: int = 0,
+        prior: str = "paper",
+        weights: Mapping[str, float] = MappingProxyType({}),
+    ):
+        super().__init__(terms, seed)
+        if prior not in PRIORS:
+            raise ValueError(f"no prior called '{prior}'{did_you_mean(prior, PRIORS)}")
+        known = {*TASK_KINDS, *(term.name for term in (*TERMS, *terms))}
+        for name in weights:
+            if name not in known:
+                raise ValueError(f"no loss called '{name}' to weigh{did_you_mean(name, known)}")
+        start = {term.name: term.fixed_weight if prior == "paper" else 1.0 for term in terms}
+        weight = [float(weights.get(name, start[name])) for name in start]
+        self.register_buffer("weight_T", torch.tensor(weight), persistent=False)
+
+    def total(self, loss_K: Tensor) -> Tensor:
+        return (self.weight_T[self.present] * loss_K).sum()

@@ -2,7 +2,7 @@
 
 Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021), section 3.2, last equation: the fixed
 weights are a good first estimate, the log-variances adjust them during training. At the start
-(s = 0) every regression term counts half of what it counts in `fixed`.
+(s = 0) every regression loss counts half of what it counts in `fixed`.
 """
 
 from collections.abc import Sequence
@@ -29,6 +29,7 @@ class FixedUncertainty(LossMethod):
         tau = torch.tensor([1.0 if term.kind == "classification" else 0.5 for term in terms])
         self.register_buffer("scale_T", tau * self.fixed_T, persistent=False)
 
-    def total(self, loss_T: Tensor) -> Tensor:
-        precision_T = torch.exp(-self.log_variance_T)
-        return (self.scale_T * precision_T * loss_T + 0.5 * self.log_variance_T).sum()
+    def total(self, loss_K: Tensor) -> Tensor:
+        log_variance_K = self.log_variance_T[self.present]
+        precision_K = torch.exp(-log_variance_K)
+        return (self.scale_T[self.present] * precision_K * loss_K + 0.5 * log_variance_K).sum()

@@ -1,8 +1,9 @@
-"""Homoscedastic uncertainty: one learned log-variance per loss term, no fixed weights.
+"""Homoscedastic uncertainty: one learned log-variance per loss, no fixed weights.
 
 Source: Kendall, Gal, Cipolla, Multi-Task Learning Using Uncertainty to Weigh Losses for Scene
 Geometry and Semantics, CVPR 2018, arXiv:1705.07115, equations 7 and 10. With s = log sigma^2, a
-classification term weighs exp(-s) and a regression term exp(-s)/2; both add s/2.
+classification loss weighs exp(-s) and a regression loss exp(-s)/2; both add s/2. Public code
+mostly takes the regression form for all, and lets the model's weight decay pull s to 0.
 """
 
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ class Uncertainty(LossMethod):
         tau = torch.tensor([1.0 if term.kind == "classification" else 0.5 for term in terms])
         self.register_buffer("tau_T", tau, persistent=False)
 
-    def total(self, loss_T: Tensor) -> Tensor:
-        precision_T = torch.exp(-self.log_variance_T)
-        return (self.tau_T * precision_T * loss_T + 0.5 * self.log_variance_T).sum()
+    def total(self, loss_K: Tensor) -> Tensor:
+        log_variance_K = self.log_variance_T[self.present]
+        precision_K = torch.exp(-log_variance_K)
+        return (self.tau_T[self.present] * precision_K * loss_K + 0.5 * log_variance_K).sum()

@@ -76,3 +76,9 @@ def restore(
     if state["rng_cuda"] and torch.cuda.is_available():
         torch.cuda.set_rng_state_all(state["rng_cuda"])
     return int(state["step"])
+
+
+def restore_weights(state: dict[str, Any], model: nn.Module, method: nn.Module) -> None:
+    """Put only the model's and the method's state back: where another training begins."""
+    model.load_state_dict(state["model"])
+    method.load_state_dict(state["method"])

@@ -9,7 +9,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
@@ -17,9 +17,10 @@ from typing import Any
 
 from mtl_bench.plain import did_you_mean, from_dict, to_dict
 
-PROTOCOL = 1  # raised when numbers made before stop being comparable with numbers made after
+PROTOCOL = 2  # raised when numbers made before stop being comparable with numbers made after
 RECIPES = Path(__file__).parent / "recipes"
 TASKS = ("panoptic", "depth")
+GRANULARITIES = ("terms", "tasks")
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Data:
     width: int = 128
     train_scenes: int = 800  # synthetic only
     val_scenes: int = 100  # synthetic only
+    frames: int = 3  # synthetic only: length of a snippet; the video stage needs 4 or more
     seed: int = 0  # synthetic only: which world
     cache: bool = True  # keep decoded frames in memory
     workers: int = 0  # data-loading processes; 0 = in the training process
@@ -73,7 +75,6 @@ class Loss:
     small_weight: float = 3.0
     center_sigma: float = 8.0  # pixels
     scales: tuple[int, ...] = (0, 1, 2)  # depth outputs in the photometric loss, 0 = finest
-    levels: tuple[int, ...] = (0,)  # of the images' pyramid, k = 1/2^k size; 0 the paper's
     automask: bool = True  # unwarped frames among the minimum's candidates
     ssim_weight: float = 0.85
 
@@ -83,7 +84,8 @@ class Optim:
     """Optimiser, schedule and length."""
 
     steps: int = 60000
-    batch: int = 12
+    batch: int = 12  # samples a step
+    micro_batch: int | None = None  # samples in memory at once, added up to a batch; None: all
     lr: float = 1e-4  # backbone, GCM, pose network
     head_lr_factor: float = 10.0  # decoders and heads
     method_lr: float = 1e-4  # a method's own parameters
@@ -94,6 +96,16 @@ class Optim:
     clip: float | None = 0.01  # total gradient norm
     precision: str = "fp32"  # fp32 | bf16 | fp16
     checkpoint_every: int = 1000  # steps
+    cosine_every: int = 0  # steps between logged cosines of the task gradients; 0 = never
+
+
+@dataclass(frozen=True)
+class PseudoLabels:
+    """The video stage's labels for frames without human ones; predictions are averaged over all."""
+
+    scales: tuple[float, ...] = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)  # of the input image
+    flip: bool = True  # each scale mirrored, too
+    min_confidence: float = 0.0  # a pixel whose class is less probable than this is left unlabeled
 
 
 @dataclass(frozen=True)
@@ -132,23 +144,54 @@ class Recipe:
     network: Network = field(default_factory=Network)
     loss: Loss = field(default_factory=Loss)
     optim: Optim = field(default_factory=Optim)
+    pseudo: PseudoLabels = field(default_factory=PseudoLabels)
     evaluate: Evaluate = field(default_factory=Evaluate)
     latency: Latency = field(default_factory=Latency)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One training run and its evaluation."""
+    """One training run and its evaluation.
+
+    Two kinds of cell need others (their `parents`) first: `video` trains its parent's checkpoint
+    on, with pseudo labels from it; `single_task` trains nothing, and evaluates and times the
+    networks of its parents together.
+
+    Raises:
+        ValueError: an unknown granularity, or options that exclude each other.
+    """
 
     recipe: Recipe
     backbone: str
-    method: str
+    method: str  # a name, or a loss-value method and a gradient method: a+b
     tasks: tuple[str, ...] = TASKS
     seed: int = 0
-    video: bool = False
+    video: bool = False  # the second training, on pseudo-labeled frames too
+    single_task: bool = False  # one network a task, each trained alone
+    granularity: str = "terms"  # what a method weighs: the loss terms, or tasks of fixed weights
     pretrained: str | None = None  # initial weights: None = random | "timm" | a file
     method_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     backbone_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        if self.granularity not in GRANULARITIES:
+            known = did_you_mean(self.granularity, GRANULARITIES)
+            raise ValueError(f"no granularity '{self.granularity}'{known}")
+        if self.single_task and self.video:
+            raise ValueError(
+                "single_task and video exclude each other: the stage needs one network"
+            )
+        if self.single_task and len(self.tasks) < 2:
+            raise ValueError(f"single_task needs two tasks or more, not {list(self.tasks)}")
+        if self.video and "panoptic" not in self.tasks:
+            raise ValueError("video needs the task panoptic: its labels are what the stage makes")
+
+    @property
+    def parents(self) -> tuple["Cell", ...]:
+        """Cells whose checkpoints this one needs."""
+        if self.single_task:
+            return tuple(replace(self, single_task=False, tasks=(task,)) for task in self.tasks)
+        return (replace(self, video=False),) if self.video else ()
 
     @property
     def id(self) -> str:
@@ -169,7 +212,10 @@ def canonical_json(cell: Cell) -> str:
     values = to_dict(cell)
     for key in ("name", "about"):
         del values["recipe"][key]
-    del values["recipe"]["optim"]["checkpoint_every"]
+    for key in ("checkpoint_every", "cosine_every"):
+        del values["recipe"]["optim"][key]
+    if not cell.video:
+        del values["recipe"]["pseudo"]
     for key in ("cache", "workers"):
         del values["recipe"]["data"][key]
     if cell.pretrained not in (None, "timm"):
@@ -215,23 +261,32 @@ def override(cell: Cell, settings: Iterable[str]) -> Cell:
     Raises:
         ValueError: no `=`, an unknown key (with the nearest known one), or a value of another type.
     """
-    values = to_dict(cell)
+    values = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise ValueError(f"'{setting}' is not key=value, such as recipe.optim.lr=3e-4")
-        *sections, last = key.strip().split(".")
-        if sections and sections[0] in ("method", "backbone"):
+        values[key.strip()] = _parse(text.strip())
+    return set_values(cell, values)
+
+
+def set_values(cell: Cell, settings: Mapping[str, Any]) -> Cell:
+    """As `override`, with values as they are; below `method.` and `backbone.` sections are made."""
+    values = to_dict(cell)
+    for key, value in settings.items():
+        *sections, last = key.split(".")
+        plug_in = sections[:1] in (["method"], ["backbone"])  # checked when it is constructed
+        if plug_in:
             sections[0] += "_args"
         target = values
         for section in sections:
-            if not isinstance(target.get(section), dict):
+            inner = target.setdefault(section, {}) if plug_in else target.get(section)
+            if not isinstance(inner, dict):
                 raise ValueError(f"unknown key '{key}'{did_you_mean(section, target)}")
-            target = target[section]
-        plug_in = bool(sections) and sections[0].endswith("_args")  # checked when it is constructed
+            target = inner
         if last not in target and not plug_in:
             raise ValueError(f"unknown key '{key}'{did_you_mean(last, target)}")
-        target[last] = _parse(text.strip())
+        target[last] = to_dict(value)
     return from_dict(Cell, values)
 
 

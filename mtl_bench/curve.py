@@ -2,6 +2,7 @@
 
 import csv
 import statistics
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -26,12 +27,13 @@ class Curve:
         self._empty = not kept
         self._file = path.open("a", newline="")
 
-    def append(self, row: dict[str, float]) -> None:
+    def append(self, row: Mapping[str, float | None]) -> None:
+        """Every row has the same keys; None leaves its place empty."""
         writer = csv.DictWriter(self._file, row.keys())
         if self._empty:
             writer.writeheader()
             self._empty = False
-        writer.writerow({key: f"{value:.6g}" for key, value in row.items()})
+        writer.writerow({k: "" if value is None else f"{value:.6g}" for k, value in row.items()})
 
     def flush(self) -> None:
         self._file.flush()

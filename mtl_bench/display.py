@@ -22,11 +22,13 @@ class Running:
     directory: Path
     began: float = field(default_factory=time.monotonic)
     progress: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""  # the grid's, where it has names
     _stage: tuple[str, int, float] = ("", 0, 0.0)  # name, first step seen, when
 
     @property
     def label(self) -> str:
-        return f"[{self.number}/{self.total}] {label(self.cell)}"
+        name = f" ({self.name})" if self.name else ""
+        return f"[{self.number}/{self.total}] {label(self.cell)}{name}"
 
     @property
     def seconds(self) -> float:
@@ -164,8 +166,10 @@ class Bars:
 def label(cell: Cell) -> str:
     """A cell in a few words: what a reader tells cells of one grid apart by."""
     words = [cell.method, cell.backbone, f"s{cell.seed}"]
-    words += [] if cell.tasks == TASKS else ["+".join(cell.tasks)]
+    words += [] if cell.tasks == TASKS else [",".join(cell.tasks)]
+    words += ["single-task"] if cell.single_task else []
     words += ["video"] if cell.video else []
+    words += [] if cell.granularity == "terms" else [f"by {cell.granularity}"]
     words += [
         f"{key}={value}"
         for args in (cell.method_args, cell.backbone_args)

@@ -1,47 +1,68 @@
-"""A grid file -> ordered cells: axes, skips with their reasons, how to tabulate the rows.
+"""A grid file -> ordered cells: axes, named rows, skips with their reasons, how to tabulate them.
 
     question = "What does the page answer?"
     recipe = "small"                # by name, or the path of a recipe file
 
     [axes]                          # their product, the first axis slowest
     backbone = ["a", "b"]           # or "all": every plug-in of the kind
-    method = ["c"]
     seed = [0, 1]
-    "method.alpha" = [0.5, 1.5]     # any key that --set takes
+    "method.alpha" = [0.5, 1.5]     # any key that --set takes; with a dot in it, it is quoted
+
+    [[row]]                         # each point of the axes gives one cell a row, in this order
+    name = "Halved"                 # what the report calls it
+    method = "c"                    # any such keys, but none of the axes
+    "method.weights" = { center = 100, offset = 0.005 }
+
+    [[row]]
+    name = "Continued, and twice as long"
+    method = "d"
+    video = true
+    "recipe.optim.steps" = "2x"     # times the recipe's number, whatever the recipe is
 
     [[skip]]                        # cells that have all these values
     backbone = "b"
-    "method.alpha" = 1.5
     why = "the reason, shown in the report"
 
-    [report]                        # read by mtl_bench/report
-    rows = "backbone"
+    [baseline]                      # what turns a cell into the one that its delta is against
+    method = "c"
+    single_task = true
 
-Cells come in the order in which they may run: one that needs another's result stands after it.
+    [report]                        # read by mtl_bench/report
+    rows = "name"                   # or an axis
+
+`method` and `backbone` stand in the axes or in every row; a file without [[row]] is the axes alone.
+Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, recipe,
+recipe.SECTION.KEY, method.KEY, backbone.KEY. Under [baseline] a cell keeps recipe, backbone and
+seed, and nothing else of its own. A wrong key is told with its line.
 """
 
 import itertools
-import json
 import re
-import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from mtl_bench import plugins
+from mtl_bench import plugins, toml_file
 from mtl_bench.config import (
+    TASKS,
     Cell,
     Recipe,
-    canonical_json,
     did_you_mean,
     load_recipe,
     override,
+    set_values,
+    to_dict,
 )
+from mtl_bench.toml_file import Place, TomlFile
 
 GRIDS = Path(__file__).parent / "grids"
-KEYS = ("question", "recipe", "axes", "skip", "report")
+KEYS = {"question": str, "recipe": str, "axes": dict, "row": list, "skip": list}
+KEYS |= {"baseline": dict, "report": dict}
+FORMS = {str: '{} = "text"', dict: "[{}], a section", list: "[[{}]], two brackets on each side"}
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
 
 
 @dataclass(frozen=True)
@@ -60,7 +81,9 @@ class Grid:
     axes: Mapping[str, tuple[Any, ...]]
     cells: tuple[Cell, ...]
     skips: tuple[Skip, ...] = ()
-    report: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    report: Mapping[str, Any] = field(default_factory=lambda: NOTHING)
+    names: Mapping[str, str] = field(default_factory=lambda: NOTHING)  # cell id -> its row's
+    baseline: Mapping[str, Any] = field(default_factory=lambda: NOTHING)  # see baseline_cell
 
 
 def grid_names() -> list[str]:
@@ -69,7 +92,24 @@ def grid_names() -> list[str]:
 
 def question_of(name: str) -> str:
     """What a grid asks, without expanding it."""
-    return str(_read(_path_of(name))[0].get("question", ""))
+    return str(_read(name).values.get("question", ""))
+
+
+def with_parents(cells: Iterable[Cell]) -> tuple[Cell, ...]:
+    """The cells and all that they need, each once and after what it needs."""
+    found: dict[str, Cell] = {}
+    for cell in cells:
+        for each in (*with_parents(cell.parents), cell):
+            found.setdefault(each.id, each)
+    return tuple(found.values())
+
+
+def baseline_cell(cell: Cell, settings: Mapping[str, Any]) -> Cell:
+    """What a cell's delta is against: its recipe, backbone and seed under a grid's [baseline]."""
+    plain = replace(
+        cell, tasks=TASKS, video=False, single_task=False, granularity="terms", method_args=NOTHING
+    )
+    return set_values(plain, settings)
 
 
 def load_grid(
@@ -87,121 +127,174 @@ def load_grid(
         recipe: in place of the grid's.
         seeds: seeds 0 .. seeds - 1 in place of the grid's.
         smoke: the recipe `smoke`, under a name that says so.
-        settings: `key=value` for every cell; replaces an axis of that name.
+        settings: `key=value` for every cell; stands in place of an axis or of a row's value, and is
+            what a row's "2x" multiplies.
         pretrained: as in `Cell`, for every cell.
 
     Raises:
         ValueError: no such grid, or a key or value that it cannot have, with file and line.
     """
-    path = _path_of(name)
-    values, text = _read(path)
-    for key in values:
-        if key not in KEYS:
-            raise _error(path, text, key, f"unknown key '{key}'{did_you_mean(key, KEYS)}")
-    axes = _axes(path, text, values.get("axes", {}))
+    file = _read(name)
+    axes = _axes(file)
     if seeds is not None:
         if seeds < 1:
             raise ValueError(f"{seeds} seeds: at least 1 is needed")
         axes["seed"] = tuple(range(seeds))
-    for key in [setting.partition("=")[0].strip() for setting in settings]:
-        axes.pop(key, None)
-    if smoke or recipe:
-        axes.pop("recipe", None)
-    chosen = "smoke" if smoke else recipe or str(values.get("recipe", "small"))
-    kept, skips = _expand(path, text, chosen, axes, values.get("skip", []), settings, pretrained)
+    rows = _rows(file, axes)
+    given = {setting.partition("=")[0].strip() for setting in settings}
+    given |= {"recipe"} if smoke or recipe else set()
+    axes = {axis: values for axis, values in axes.items() if axis not in given}
+    for row in rows if "recipe" in given else ():
+        row.pop("recipe", None)
+    chosen = "smoke" if smoke else recipe or str(file.values.get("recipe", "small"))
+    start = Cell(load_recipe(chosen), "", "", pretrained=pretrained)
+    cells, skips, names = _expand(file, start, axes, rows, settings)
+    baseline = file.values.get("baseline", {})
+    _set(file, start, baseline, ("baseline", 0))
     return Grid(
-        name=f"{path.stem}-smoke" if smoke else path.stem,
-        question=str(values.get("question", "")),
-        recipe=load_recipe(chosen),
+        name=f"{file.path.stem}-smoke" if smoke else file.path.stem,
+        question=str(file.values.get("question", "")),
+        recipe=start.recipe,
         axes=MappingProxyType(axes),
-        cells=kept,
+        cells=cells,
         skips=skips,
-        report=MappingProxyType(values.get("report", {})),
+        report=MappingProxyType(file.values.get("report", {})),
+        names=MappingProxyType(names),
+        baseline=MappingProxyType(baseline),
     )
 
 
-def _path_of(name: str) -> Path:
+# --- the file -------------------------------------------------------------------------------------
+
+
+def _read(name: str) -> TomlFile:
+    """Find and read a grid file; its keys are known ones and of the right form."""
     path = Path(name) if name.endswith(".toml") else GRIDS / f"{name}.toml"
     if not path.is_file():
         hint = "" if name.endswith(".toml") else did_you_mean(name, grid_names())
         raise ValueError(f"no grid called '{name}'{hint}; a file of your own: --grid PATH.toml")
-    return path
+    file = toml_file.read(path)
+    for key, value in file.values.items():
+        wrong = f"unknown key '{key}'{did_you_mean(key, KEYS)}" if key not in KEYS else ""
+        if not wrong and not isinstance(value, KEYS[key]):
+            wrong = f"write it as {FORMS[KEYS[key]].format(key)}"
+        if wrong:
+            raise file.error(wrong, key, ("", 0), (key, 0))
+    file.refuse_sections_in("axes", "row", "skip", "baseline")
+    return file
 
 
-def _read(path: Path) -> tuple[dict[str, Any], str]:
-    text = path.read_text(encoding="utf-8")
-    try:
-        return tomllib.loads(text), text
-    except tomllib.TOMLDecodeError as error:  # has line and column
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _axes(path: Path, text: str, axes: Any) -> dict[str, tuple[Any, ...]]:
-    if not isinstance(axes, dict):
-        raise _error(path, text, "axes", "[axes] is a section: axis = [values]")
+def _axes(file: TomlFile) -> dict[str, tuple[Any, ...]]:
     found: dict[str, tuple[Any, ...]] = {}
-    for axis, values in axes.items():
+    for axis, values in file.values.get("axes", {}).items():
         if values == "all" and f"{axis}s" in plugins.KINDS:
             values = list(plugins.files(f"{axis}s"))
         if not isinstance(values, list) or not values:
-            raise _error(path, text, axis, f"axis '{axis}' is a list of values, not {values!r}")
+            message = f"axis '{axis}' is a list of values, not {values!r}"
+            raise file.error(message, axis, ("axes", 0))
         found[axis] = tuple(values)
-    for axis in ("method", "backbone"):
-        if axis not in found:
-            raise _error(path, text, "axes", f"axis '{axis}' is missing")
     return found
 
 
+def _rows(file: TomlFile, axes: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Each has a name of its own and no axis in it; method and backbone are somewhere."""
+    rows: list[dict[str, Any]] = file.values.get("row", [])
+    names = [row.get("name") for row in rows]
+    for index, (row, name) in enumerate(zip(rows, names, strict=True)):
+        place = ("row", index)
+        if not isinstance(name, str):
+            raise file.error("a [[row]] needs its name: name = '...'", "name", place)
+        if name in names[:index]:
+            raise file.error(f"two rows are called '{name}'", "name", place)
+        for key in row:
+            if key in axes:
+                raise file.error(f"'{key}' is an axis; it cannot stand in a row, too", key, place)
+    for key in ("method", "backbone"):
+        without = [index for index, row in enumerate(rows or [{}]) if key not in row]
+        if key not in axes and without:
+            raise file.error(f"'{key}' is missing", "name", ("row", without[0]), ("axes", 0))
+    return rows
+
+
+# --- cells ----------------------------------------------------------------------------------------
+
+
 def _expand(
-    path: Path,
-    text: str,
-    recipe: str,
+    file: TomlFile,
+    start: Cell,
     axes: Mapping[str, tuple[Any, ...]],
-    skip: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
     settings: Sequence[str],
-    pretrained: str | None,
-) -> tuple[tuple[Cell, ...], tuple[Skip, ...]]:
-    """The product of the axes, less the skips; equal cells count once."""
-    for rule in skip:
+) -> tuple[tuple[Cell, ...], tuple[Skip, ...], dict[str, str]]:
+    """The product of axes and rows, less the skips; equal cells count once."""
+    skip = file.values.get("skip", [])
+    for index, rule in enumerate(skip):
         if not isinstance(rule.get("why"), str):
-            raise _error(path, text, "skip", "a [[skip]] needs its reason: why = '...'")
+            raise file.error("a [[skip]] needs its reason: why = '...'", "", ("skip", index))
+        for key in [key for key in rule if key != "why"]:
+            _set(file, start, {key: rule[key]}, ("skip", index))
     kept: dict[str, Cell] = {}
     skipped: dict[str, Skip] = {}
-    for point in itertools.product(*axes.values()):
-        values = dict(zip(axes, point, strict=True))
-        blank = Cell(load_recipe(values.pop("recipe", recipe)), "", "", pretrained=pretrained)
-        cell = blank
-        for axis, value in values.items():
-            try:
-                cell = override(cell, [f"{axis}={json.dumps(value)}"])  # JSON scalars are TOML's
-            except ValueError as error:
-                raise _error(path, text, axis, str(error)) from error
-        cell = override(cell, settings)
-        why = next((rule["why"] for rule in skip if _matches(path, text, rule, cell)), None)
-        if why is None:
-            kept.setdefault(cell.id, cell)
-        else:
+    names: dict[str, str] = {}
+    points = [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
+    for point, (index, row) in itertools.product(points, enumerate(rows or [NOTHING])):
+        values = {key: value for key, value in {**point, **row}.items() if key != "name"}
+        cell = _cell(file, start, values, settings, ("row", index), ("axes", 0))
+        why = next((rule["why"] for rule in skip if _matches(rule, cell)), None)
+        if why is not None:
             skipped.setdefault(cell.id, Skip(cell, why))
-    return tuple(kept.values()), tuple(skipped.values())
-
-
-def _matches(path: Path, text: str, rule: Mapping[str, Any], cell: Cell) -> bool:
-    """Whether a cell already has every value that the rule names."""
-    for key, value in rule.items():
-        if key == "why":
             continue
+        kept.setdefault(cell.id, cell)
+        if rows and names.setdefault(cell.id, row["name"]) != row["name"]:
+            message = f"rows '{names[cell.id]}' and '{row['name']}' are the same cell"
+            raise file.error(message, "name", ("row", index))
+    return tuple(kept.values()), tuple(skipped.values()), names
+
+
+def _cell(
+    file: TomlFile, start: Cell, values: dict[str, Any], settings: Sequence[str], *places: Place
+) -> Cell:
+    """One point of the grid: its values, then `--set`, then what multiplies a number."""
+    recipe = values.pop("recipe", None)
+    if recipe is not None:
         try:
-            changed = override(cell, [f"{key}={json.dumps(value)}"])
+            start = replace(start, recipe=load_recipe(str(recipe)))
         except ValueError as error:
-            raise _error(path, text, key, str(error)) from error
-        if canonical_json(changed) != canonical_json(cell):
-            return False
-    return True
+            raise file.error(str(error), "recipe", *places) from error
+    factors = {k: v for k, v in values.items() if isinstance(v, str) and TIMES.fullmatch(v)}
+    plain = {key: value for key, value in values.items() if key not in factors}
+    cell = override(_set(file, start, plain, *places), settings)
+    return _set(file, cell, {k: _times(cell, k, v) for k, v in factors.items()}, *places)
 
 
-def _error(path: Path, text: str, key: str, message: str) -> ValueError:
-    """With the line on which a key stands; tomllib keeps no positions."""
-    pattern = re.compile(rf"""^\s*(\[+\s*)?["']?{re.escape(key)}["']?\s*(=|\]|$)""")
-    lines = (i for i, line in enumerate(text.splitlines(), 1) if pattern.match(line))
-    line = next(lines, None)
-    return ValueError(f"{path}{'' if line is None else f', line {line}'}: {message}")
+def _times(cell: Cell, key: str, factor: str) -> Any:
+    """A cell's number times 2 for "2x", whole where it is; the text where there is no number."""
+    number = to_dict(cell)
+    for part in key.split("."):
+        number = number.get(part) if isinstance(number, dict) else None
+    if type(number) not in (int, float):
+        return factor
+    product = float(factor[:-1]) * number
+    return round(product) if type(number) is int else product
+
+
+def _set(file: TomlFile, cell: Cell, values: Mapping[str, Any], *places: Place) -> Cell:
+    """Set all at once; a mistake is looked for key by key, and told with its line."""
+    try:
+        return set_values(cell, values)
+    except ValueError as error:
+        for key, value in values.items():
+            try:
+                set_values(cell, {key: value})
+            except ValueError as own:
+                raise file.error(str(own), key, *places) from own
+        raise file.error(str(error), "", *places) from error
+
+
+def _matches(rule: Mapping[str, Any], cell: Cell) -> bool:
+    """Whether a cell already has every value that the rule names."""
+    values = {key: value for key, value in rule.items() if key != "why"}
+    try:
+        return set_values(cell, values).id == cell.id
+    except ValueError:  # values that this cell cannot have together with its own
+        return False

@@ -2,7 +2,7 @@
 
 The command of a cell is always `python -m mtl_bench train runs/X/cell.json ...`, here as in a
 terminal. State is the run directories: a launcher that was killed is simply started again, and two
-launchers on one grid share its cells.
+launchers on one grid share its cells. A cell that needs others waits until they are done.
 """
 
 import contextlib
@@ -13,14 +13,16 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mtl_bench import claim, results
 from mtl_bench.config import Cell, to_dict
 from mtl_bench.display import Display, Running, duration
+from mtl_bench.grids import with_parents
 from mtl_bench.provenance import cores
+from mtl_bench.quiet import SIDE_BY_SIDE
 
 CLAIMED = 75  # exit code of a cell that another process runs
 INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a cell that was told to stop
@@ -32,7 +34,7 @@ Command = Callable[[Cell], Sequence[str]]
 
 
 def to_run(cells: Iterable[Cell], runs: Path, rerun: str | None = None) -> list[Cell]:
-    """The cells without a result, and those asked for again.
+    """The cells without a result, those asked for again, and before them what they need.
 
     Args:
         rerun: `stale`: also those whose code changed. `failed`: those that failed begin at step 0
@@ -40,7 +42,8 @@ def to_run(cells: Iterable[Cell], runs: Path, rerun: str | None = None) -> list[
     """
     wanted = {"missing", "interrupted", "failed", "running"}
     wanted |= {"stale"} if rerun == "stale" else set(results.WORDS) if rerun == "all" else set()
-    return [cell for cell in cells if results.status(cell, runs) in wanted]
+    own = [cell for cell in cells if results.status(cell, runs) in wanted]
+    return [cell for cell in with_parents(own) if results.status(cell, runs) in wanted]
 
 
 def cell_command(cell: Cell, runs: Path, data: Path, options: Sequence[str] = ()) -> list[str]:
@@ -64,7 +67,9 @@ class Launcher:
     display: Display
     jobs: int = 1
     rerun: str | None = None
+    names: Mapping[str, str] = field(default_factory=dict)  # cell id -> what the grid calls it
     _running: list[Job] = field(default_factory=list)
+    _unsettled: set[str] = field(default_factory=set)  # ids whose cells have not ended here yet
     _elsewhere: set[str] = field(default_factory=set)  # ids that another process was seen running
     _states: dict[str, results.State] = field(default_factory=dict)
     _began: float = field(default_factory=time.time)
@@ -72,13 +77,16 @@ class Launcher:
     def run(self, cells: Sequence[Cell]) -> dict[str, results.State]:
         """Run all; on Ctrl-C the running ones are told to save and stop.
 
+        A cell whose parent has no usable result in the end is not run: its state is `missing`.
+
         Raises:
             KeyboardInterrupt: after they have stopped.
         """
-        queue = deque(
-            Job(number, len(cells), cell, results.run_dir(cell, self.runs))
-            for number, cell in enumerate(cells, 1)
-        )
+        queue: deque[Job] = deque()
+        for number, cell in enumerate(cells, 1):
+            directory, name = results.run_dir(cell, self.runs), self.names.get(cell.id, "")
+            queue.append(Job(number, len(cells), cell, directory, name=name))
+        self._unsettled = {cell.id for cell in cells}
         try:
             while queue or self._running:
                 self._fill(queue)
@@ -91,21 +99,47 @@ class Launcher:
         return self._states
 
     def _fill(self, queue: deque[Job]) -> None:
-        """Start queued cells in free places, passing over those that another process runs."""
-        for _ in range(len(queue)):
-            if len(self._running) >= self.jobs:
-                return
+        """Start queued cells in free places; those that must wait keep their place in the queue."""
+        waiting = []
+        while queue and len(self._running) < self.jobs:
             job = queue.popleft()
             state = results.inspect(job.cell, self.runs)
             if state.word == "running":
                 if job.cell.id not in self._elsewhere:
                     self.display.say(f"{job.label}  is run by another process")
                 self._elsewhere.add(job.cell.id)
-                queue.append(job)
+                waiting.append(job)
             elif self._settled_elsewhere(job, state):
                 self._end(job, state, "by another process")
+            elif self._must_wait(job):
+                waiting.append(job)
+            elif lack := self._lack(job):
+                self._give_up(job, lack)
             else:
                 self._start(job, state)
+        queue.extendleft(reversed(waiting))
+
+    def _must_wait(self, job: Job) -> bool:
+        """Whether a parent is still to run, here or in another process."""
+        return any(
+            parent.id in self._unsettled or results.status(parent, self.runs) == "running"
+            for parent in job.cell.parents
+        )
+
+    def _lack(self, job: Job) -> str:
+        """What keeps a cell from ever running: a parent without a result that may be used."""
+        for parent in job.cell.parents:
+            state = results.inspect(parent, self.runs)
+            if state.word != "done":
+                remedy = "; --rerun stale" if state.word == "stale" else ""
+                why = f" ({state.why}{remedy})" if state.why else ""
+                return f"needs {parent.slug}, which is {state.word}{why}"
+        return ""
+
+    def _give_up(self, job: Job, lack: str) -> None:
+        self._unsettled.discard(job.cell.id)
+        self._states[job.cell.id] = results.State("missing", lack)
+        self.display.ended(job, f"{job.label}  NOT RUN  {lack}", False)
 
     def _settled_elsewhere(self, job: Job, state: results.State) -> bool:
         """Whether another process brought the cell to an end since this launcher began."""
@@ -160,6 +194,7 @@ class Launcher:
         return results.stored(job.cell, self.runs)
 
     def _end(self, job: Job, state: results.State, how: str = "") -> None:
+        self._unsettled.discard(job.cell.id)
         self._states[job.cell.id] = state
         ok = state.word in ("done", "stale")
         word = state.word if ok else state.word.upper()
@@ -189,6 +224,7 @@ def child_environment(jobs: int) -> dict[str, str]:
     extra = {claim.LAUNCHER: str(os.getpid()), "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if jobs > 1:
         extra["OMP_NUM_THREADS"] = str(max(1, cores() // jobs))
+        extra[SIDE_BY_SIDE] = str(jobs)
     return {**os.environ, **extra}
 
 
@@ -216,9 +252,14 @@ def summary(cells: Sequence[Cell], runs: Path) -> str:
     return "   ".join(f"{word} {n}{hints.get(word, '')}" for word, n in counts.items() if n)
 
 
-def hours_to_run(todo: int, cells: Sequence[Cell], runs: Path) -> float | None:
-    """Expected duration of cells, from the mean of those that are done; None where none is."""
-    rows = [row for row in (results.inspect(cell, runs).row for cell in cells) if row is not None]
+def hours_to_run(todo: Sequence[Cell], cells: Sequence[Cell], runs: Path) -> float | None:
+    """Expected duration of cells, from the mean of those that are done; None where none is.
+
+    Only cells that train count: a single-task cell's row repeats the times of its parents.
+    """
+    states = [results.inspect(cell, runs) for cell in cells if not cell.single_task]
+    rows = [state.row for state in states if state.row is not None]
     times = [[v for k, v in row.get("time", {}).items() if k.endswith("_s")] for row in rows]
     known = [sum(values) for values in times if values]
-    return todo * sum(known) / len(known) / 3600 if known else None
+    count = sum(not cell.single_task for cell in todo)
+    return count * sum(known) / len(known) / 3600 if known else None

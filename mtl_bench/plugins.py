@@ -212,13 +212,30 @@ def load(kind: str, name: str) -> type[Any]:
     return found[0]
 
 
+def part_names(method: str) -> list[str]:
+    """The names in `a` or in a composition `a+b`."""
+    return method.split("+")
+
+
 def fingerprint(kind: str, name: str) -> str:
-    """12 hexadecimal digits of the file and of the `_*.py` helpers beside it."""
-    path = path_of(kind, name)
+    """12 hexadecimal digits of the file (or of both files of `a+b`) and the helpers it imports."""
     digest = hashlib.sha256()
-    for part in (path, *sorted(path.parent.glob("_*.py"))):
-        digest.update(part.read_bytes().replace(b"\r\n", b"\n") + b"\0")
+    for part in part_names(name):
+        for path in _with_helpers(path_of(kind, part)):
+            digest.update(path.read_bytes().replace(b"\r\n", b"\n") + b"\0")
     return digest.hexdigest()[:12]
+
+
+def _with_helpers(path: Path) -> list[Path]:
+    """A file and the `_*.py` beside it that it imports, directly or through another."""
+    found, left = {path}, [path]
+    while left:
+        for helper in re.findall(r"^\s*from \.(\w+) import", left.pop().read_text(), re.MULTILINE):
+            beside = path.with_name(f"{helper}.py")
+            if beside.is_file() and beside not in found:
+                found.add(beside)
+                left.append(beside)
+    return sorted(found)
 
 
 def settings(kind: str, name: str) -> dict[str, Any]:
@@ -240,11 +257,7 @@ def check_cells(cells: Iterable[Cell]) -> None:
                 raise ValueError(f"no task called '{task}'{did_you_mean(task, TASKS)}")
         if not cell.tasks:
             raise ValueError(f"a cell needs a task: {', '.join(TASKS)}")
-        chosen: tuple[tuple[str, str, Mapping[str, Any]], ...] = (
-            ("methods", cell.method, cell.method_args),
-            ("backbones", cell.backbone, cell.backbone_args),
-        )
-        for kind, name, values in chosen:
+        for kind, name, values in _chosen(cell):
             if (kind, name, tuple(values)) in seen:
                 continue
             seen.add((kind, name, tuple(values)))
@@ -254,3 +267,16 @@ def check_cells(cells: Iterable[Cell]) -> None:
                 if key not in known:
                     word = kind[:-1]
                     raise ValueError(f"{word} '{name}' has no '{key}'{did_you_mean(key, known)}")
+
+
+def _chosen(cell: Cell) -> list[tuple[str, str, Mapping[str, Any]]]:
+    """Kind, name and settings of a cell's plug-ins; of `a+b`, settings come by part."""
+    names = part_names(cell.method)
+    parts = {names[0]: cell.method_args} if len(names) == 1 else dict(cell.method_args)
+    for name in parts:
+        if name not in names:
+            raise ValueError(
+                f"method '{cell.method}' has no part '{name}': --set method.{names[0]}.KEY=VALUE"
+            )
+    methods = [("methods", name, parts.get(name, {})) for name in names]
+    return [*methods, ("backbones", cell.backbone, cell.backbone_args)]

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
+from mtl_bench.quiet import Quiet
+
 
 class Interrupted(KeyboardInterrupt):
     """The run was asked to stop, saved its state and stopped."""
@@ -21,6 +23,7 @@ class Progress:
         self._echo = echo
         self._last = 0.0
         self._start = time.monotonic()
+        self.quiet = Quiet(run_dir.parent)
         self.stop_asked = False
 
     def catch_signals(self) -> None:
@@ -36,6 +39,8 @@ class Progress:
         self._echo(line)
 
     def update(self, stage: str, step: int, steps: int, note: str = "") -> None:
+        """After every step of a stage; waits here while another cell is timed."""
+        self.quiet.pass_by()
         now = time.monotonic()
         if now - self._last < self._every_s and step < steps:
             return

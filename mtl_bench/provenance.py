@@ -20,6 +20,7 @@ HARNESS = (  # what numbers depend on; the rest launches, stores or shows
     "losses",
     "metrics",
     "method.py",
+    "gradients.py",
     "backward.py",
     "engine.py",
     "geometry.py",
@@ -27,6 +28,7 @@ HARNESS = (  # what numbers depend on; the rest launches, stores or shows
     "postprocess.py",
     "train.py",
     "evaluate.py",
+    "pseudo_labels.py",
     "latency.py",
 )
 PACKAGES = (

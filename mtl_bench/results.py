@@ -6,6 +6,8 @@ runs/<method>-<backbone>-s<seed>-<id>/
     claim          who is running it now
     progress.json  how far that is
     last.pt        checkpoint          curve.csv  losses, weights, rate per step
+    taken.json     memory, and seconds of pseudo labels, for a run that is continued
+    pseudo_labels/ of a video cell, made by its parent's checkpoint
     log.txt        what the run printed
     row.json       the result; it appears by rename at the very end, so it exists = done
     failed.json    why there is none
@@ -18,9 +20,10 @@ import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, get_args
 
-from mtl_bench import provenance
+from mtl_bench import plugins, provenance
 from mtl_bench.claim import claimed_by
 from mtl_bench.config import Cell, from_dict, to_dict
 
@@ -133,7 +136,7 @@ def changed(before: dict[str, str], cell: Cell) -> str:
     except ValueError as error:  # a plug-in that has gone, or has a double now
         return str(error)
     words = {
-        "method": f"methods/{cell.method}.py",
+        "method": " or ".join(f"methods/{name}.py" for name in plugins.part_names(cell.method)),
         "backbone": f"backbones/{cell.backbone}.py",
         "harness": "harness",
     }
@@ -141,8 +144,14 @@ def changed(before: dict[str, str], cell: Cell) -> str:
     return f"{', '.join(different)} changed" if different else ""
 
 
-def rows(cells: Iterable[Cell], runs: Path) -> list[dict[str, Any]]:
-    """One row per cell for a report: as stored where there is one, with the status of today."""
+def rows(
+    cells: Iterable[Cell], runs: Path, names: Mapping[str, str] = MappingProxyType({})
+) -> list[dict[str, Any]]:
+    """One row per cell for a report: as stored where there is one, with the status of today.
+
+    Args:
+        names: cell id -> what the grid calls it.
+    """
     found = []
     for cell in cells:
         state = inspect(cell, runs)
@@ -154,11 +163,15 @@ def rows(cells: Iterable[Cell], runs: Path) -> list[dict[str, Any]]:
             "tasks": list(cell.tasks),
             "seed": cell.seed,
             "video": cell.video,
+            "single_task": cell.single_task,
+            "granularity": cell.granularity,
             "recipe": cell.recipe.name,
             "smoke": cell.recipe.smoke,
             "cell": to_dict(cell),
         }
-        found.append({**blank, **(state.row or {}), "status": state.word, "error": state.why})
+        named = {"name": names[cell.id]} if cell.id in names else {}
+        today = {"status": state.word, "error": state.why}
+        found.append({**blank, **(state.row or {}), **named, **today})
     return found
 
 

@@ -1,14 +1,18 @@
 """One cell, whole: train, evaluate, time, and the row that says so."""
 
 import os
+import resource
+import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from mtl_bench import checkpoint, provenance, results
+from mtl_bench import checkpoint, provenance, pseudo_labels, results
 from mtl_bench.config import Cell, to_dict
 from mtl_bench.curve import training_time
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
@@ -17,12 +21,23 @@ from mtl_bench.engine import Engine, choose_device
 from mtl_bench.evaluate import Evaluation, evaluate
 from mtl_bench.export_predictions import export_predictions
 from mtl_bench.latency import measure
-from mtl_bench.model import Model
-from mtl_bench.progress import Progress
+from mtl_bench.model import Model, side_by_side
+from mtl_bench.progress import Interrupted, Progress
+from mtl_bench.quiet import SIDE_BY_SIDE
 from mtl_bench.tracking import Tracker
-from mtl_bench.train import build, train
+from mtl_bench.train import CHECKPOINT, build, train
 
 LABELS = CITYSCAPES20
+TAKEN = "taken.json"  # what training took beside the curve's steps, for a run that is continued
+
+
+@dataclass
+class Trained:
+    """A cell's model, and what it took to get it."""
+
+    model: Model
+    time: dict[str, float]  # train_s, step_ms, peak_mib; of a video cell also pseudo_s
+    protocol: dict[str, Any]
 
 
 def run_cell(
@@ -42,6 +57,9 @@ def run_cell(
 
     Returns:
         The row, as `row.json` has it.
+
+    Raises:
+        ValueError: a parent of the cell has no result or no checkpoint.
     """
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
     progress = Progress(run_dir, echo)
@@ -50,9 +68,12 @@ def run_cell(
     environment = provenance.environment(engine.device)
     results.write_json(run_dir / "env.json", environment)
 
-    model = train(cell, LABELS, root, run_dir, engine, progress, tracker)
-    train_s, step_ms = training_time(run_dir / "curve.csv")
-    echo(f"trained {cell.recipe.optim.steps} steps in {train_s:.0f} s ({step_ms:.0f} ms a step)")
+    if cell.single_task:
+        trained = _trained_apart(cell, run_dir, engine)
+    else:
+        trained = _train(cell, run_dir, root, engine, progress, tracker)
+    model, took = trained.model, trained.time
+    echo(f"trained in {took['train_s']:.0f} s ({took['step_ms']:.0f} ms a step)")
 
     start = time.perf_counter()
     evaluation = evaluate(
@@ -62,16 +83,18 @@ def run_cell(
     echo(f"evaluated in {eval_s:.0f} s: {results.headline(evaluation.metrics)}")
     _save_samples(run_dir / "samples.npz", evaluation.samples)
 
+    progress.update("latency", 0, 1)
     start = time.perf_counter()
-    timing = time_cell(model, cell, root, engine)
+    with progress.quiet.alone(neighbours=SIDE_BY_SIDE in os.environ):
+        timing = time_cell(model, cell, root, engine)
     latency_s = time.perf_counter() - start
     echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
 
     row = {
         **_identity(cell),
         "metric": {**evaluation.metrics, **timing},
-        "protocol": evaluation.protocol,
-        "time": {"train_s": train_s, "step_ms": step_ms, "eval_s": eval_s, "latency_s": latency_s},
+        "protocol": {**evaluation.protocol, **_training_protocol(cell, root), **trained.protocol},
+        "time": {**took, "eval_s": eval_s, "latency_s": latency_s},
         "code": provenance.code(cell),
         "env": environment,
     }
@@ -79,6 +102,101 @@ def run_cell(
     tracker.finish()
     results.write_json(run_dir / "row.json", row)
     return row
+
+
+# --- training -------------------------------------------------------------------------------------
+
+
+def _train(
+    cell: Cell, run_dir: Path, root: Path, engine: Engine, progress: Progress, tracker: Tracker
+) -> Trained:
+    """Train; a video cell goes on from its parent's checkpoint, with labels that this one made."""
+    taken: dict[str, Any] = results.read_json(run_dir / TAKEN) or {}
+    start = labels = None
+    protocol = {}
+    if cell.video:
+        _, start = _result_of(cell.parents[0], run_dir.parent)
+        labels, frames = _pseudo_labels(cell, start, root, run_dir, engine, progress, taken)
+        protocol = {"pseudo_frames": frames}
+    if engine.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(engine.device)
+    given = (cell, LABELS, root, run_dir, engine, progress, tracker)
+    model = train(*given, start=start, sequence_labels=labels)
+    taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(engine.device))
+    results.write_json(run_dir / TAKEN, taken)
+    train_s, step_ms = training_time(run_dir / "curve.csv")
+    return Trained(model, {"train_s": train_s, "step_ms": step_ms, **taken}, protocol)
+
+
+def _pseudo_labels(
+    cell: Cell,
+    parent_checkpoint: Path,
+    root: Path,
+    run_dir: Path,
+    engine: Engine,
+    progress: Progress,
+    taken: dict[str, Any],
+) -> tuple[Path, int]:
+    """Make what labels are missing; their folder and number. `taken` gets the seconds."""
+    model = load_model(cell.parents[0], parent_checkpoint, engine)
+    counts: list[int] = []  # of labelled frames: at the start, and after each
+
+    def note(done: int, of: int) -> None:
+        counts.append(done)
+        progress.update("pseudo-label", done, of)
+        if progress.stop_asked:
+            raise Interrupted(f"stopped at pseudo label {done} of {of}, kept in {run_dir}")
+
+    began = time.perf_counter()
+    out = run_dir / "pseudo_labels"
+    folder = pseudo_labels.ensure(model, cell, root, out, engine.device, note)
+    made = counts[-1] - counts[0]
+    if made:  # a run that was killed here made the others, as fast
+        taken["pseudo_s"] = (time.perf_counter() - began) * counts[-1] / made
+        results.write_json(run_dir / TAKEN, taken)
+        progress.say(f"labelled {made} frames in {taken['pseudo_s']:.0f} s")
+    return folder, counts[-1]
+
+
+def _trained_apart(cell: Cell, run_dir: Path, engine: Engine) -> Trained:
+    """The networks of a single-task cell's parents, side by side."""
+    times = [_result_of(parent, run_dir.parent)[0]["time"] for parent in cell.parents]
+    took = {key: sum(time[key] for time in times) for key in ("train_s", "step_ms")}
+    took["peak_mib"] = max(time["peak_mib"] for time in times)
+    return Trained(load_model(cell, run_dir / CHECKPOINT, engine), took, {})
+
+
+def _result_of(parent: Cell, runs: Path) -> tuple[dict[str, Any], Path]:
+    """Row and checkpoint of a cell that another needs.
+
+    Raises:
+        ValueError: it lacks one of them, or they are of other code.
+    """
+    state = results.stored(parent, runs)
+    path = results.run_dir(parent, runs) / CHECKPOINT
+    word = state.word if path.is_file() or state.word != "done" else "without its checkpoint"
+    if word != "done" or state.row is None:
+        why = f" ({state.why})" if state.why else ""
+        raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: run that one again")
+    return state.row, path
+
+
+def _peak_mib(device: torch.device) -> float:
+    """Most memory that training held: of CUDA's allocator, or all that this process ever had."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+def _training_protocol(cell: Cell, root: Path) -> dict[str, Any]:
+    """What kept the sky and the ego vehicle out of the photometric loss."""
+    if "depth" not in cell.tasks:
+        return {}
+    return {"reprojection_mask": open_dataset(cell, "train", root, training=True).reprojection_mask}
+
+
+# --- stored models --------------------------------------------------------------------------------
 
 
 def reevaluate(
@@ -104,9 +222,17 @@ def reevaluate(
 def load_model(cell: Cell, path: Path, engine: Engine, labels: LabelSet = LABELS) -> Model:
     """A cell's model with the weights of a checkpoint.
 
+    Args:
+        path: the run's checkpoint. A single-task cell has none: its parents' are taken, in the
+            folders beside that one.
+
     Raises:
         ValueError: no readable checkpoint there, or one of another model.
     """
+    if cell.single_task:
+        paths = [path.parent.parent / parent.slug / CHECKPOINT for parent in cell.parents]
+        pairs = zip(cell.parents, paths, strict=True)
+        return side_by_side([load_model(parent, file, engine, labels) for parent, file in pairs])
     state = checkpoint.read(path)
     model = build(cell, labels, engine)[0]
     try:
@@ -118,11 +244,13 @@ def load_model(cell: Cell, path: Path, engine: Engine, labels: LabelSet = LABELS
 
 
 def time_cell(model: Model, cell: Cell, root: Path, engine: Engine) -> dict[str, Any]:
-    """The latency protocol over the evaluation split's frames."""
+    """The latency protocol over the evaluation split's frames, on all of this process's cores."""
     recipe = cell.recipe
+    threads = torch.get_num_threads()
+    torch.set_num_threads(max(threads, provenance.cores()))  # fewer where cells run side by side
     dataset = open_dataset(cell, recipe.evaluate.split, root, training=False)
     batches = [dataset.sample(index, None) for index in range(len(dataset))]
-    return measure(
+    timing = measure(
         model,
         (sample.image_B3HW for sample in batches),
         batches[0].K_B33,
@@ -133,6 +261,8 @@ def time_cell(model: Model, cell: Cell, root: Path, engine: Engine) -> dict[str,
         engine.device,
         engine.precision,
     )
+    torch.set_num_threads(threads)
+    return timing
 
 
 def _identity(cell: Cell) -> dict[str, Any]:
@@ -149,6 +279,8 @@ def _identity(cell: Cell) -> dict[str, Any]:
         "tasks": list(cell.tasks),
         "seed": cell.seed,
         "video": cell.video,
+        "single_task": cell.single_task,
+        "granularity": cell.granularity,
         "pretrained": values["pretrained"],
         "recipe": cell.recipe.name,
         "smoke": cell.recipe.smoke,

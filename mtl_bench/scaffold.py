@@ -6,7 +6,8 @@ from mtl_bench.plugins import NAME, files
 
 METHOD = '''"""{title}: one line that `mtl-bench list` shows.
 
-Source: authors, title, venue, year, arXiv number, equation or algorithm. Then what departs from it.
+Source: authors, title, venue and year (as in ICLR 2021), arXiv number, equation or algorithm. Then
+what departs from it.
 """
 
 from collections.abc import Sequence
@@ -18,10 +19,10 @@ from mtl_bench.losses.terms import Term
 from mtl_bench.method import LossMethod
 
 
-# For a method that needs the gradient of every term, derive from mtl_bench.method.GradientMethod
-# and write weights(G_TT, loss_T) or direction(J_TP, loss_T) in place of total.
+# For a method that needs the gradient of every loss, derive from mtl_bench.method.GradientMethod
+# and write weights(G_KK, loss_K) or direction(J_KP, loss_K) in place of total.
 class {title}(LossMethod):
-    """sum_i exp(-s_i) w_i L_i + s_i / 2, with w the fixed weights and s learned.
+    """sum_i exp(-s_i) w_i L_i + s_i / 2, with w the fixed weights and s learned
 
     Args:
         init: every s_i at the start. Arguments like this one are set with --set method.init=0.5.
@@ -32,9 +33,11 @@ class {title}(LossMethod):
         # State that training changes is a parameter (learned) or a buffer: both are checkpointed.
         self.s_T = nn.Parameter(torch.full((len(terms),), init))
 
-    def total(self, loss_T: Tensor) -> Tensor:
+    def total(self, loss_K: Tensor) -> Tensor:
         """Unweighted losses, in the order of self.terms -> the scalar to minimise."""
-        return (torch.exp(-self.s_T) * self.fixed_T * loss_T + 0.5 * self.s_T).sum()
+        here = self.present  # which K of the T losses: a batch may lack a task's labels
+        s_K, fixed_K = self.s_T[here], self.fixed_T[here]
+        return (torch.exp(-s_K) * fixed_K * loss_K + 0.5 * s_K).sum()
 '''
 
 BACKBONE = '''"""{title}: one line that `mtl-bench list` shows; parameters, licence of the weights.

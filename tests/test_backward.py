@@ -1,41 +1,110 @@
-"""Losses and a method become gradients in one place; both kinds of method agree where they must."""
+"""Losses and a method become gradients in one place; all kinds of method agree where they must."""
+
+from functools import partial
 
 import pytest
 import torch
+from torch import nn
 
 from mtl_bench import plugins
-from mtl_bench.backward import backward
-from mtl_bench.check import TERMS, Quadratics
-from mtl_bench.losses.terms import terms_of
-from mtl_bench.method import GradientMethod, LossMethod
+from mtl_bench.backward import Pass, backward, losses_now
+from mtl_bench.check.methods import TERMS, Quadratics
+from mtl_bench.gradients import frozen_statistics
+from mtl_bench.losses.terms import gather, terms_of
+from mtl_bench.method import Composed, GradientMethod, LookAheadMethod, LossMethod
 
 
 class Sum(LossMethod):
-    def total(self, loss_T):
-        return loss_T.sum()
+    def total(self, loss_K):
+        return loss_K.sum()
+
+
+class Squares(LossMethod):
+    """Weights that depend on the losses."""
+
+    def total(self, loss_K):
+        return loss_K.square().sum()
 
 
 class SumOfGradients(GradientMethod):
-    def weights(self, G_TT, loss_T):
-        return torch.ones_like(loss_T)
+    def weights(self, G_KK, loss_K):
+        return torch.ones_like(loss_K)
+
+
+class SumAtRepresentation(SumOfGradients):
+    space = "representation"
 
 
 class Halved(GradientMethod):
     weighted_heads = True
 
-    def weights(self, G_TT, loss_T):
-        assert G_TT.dtype == torch.float64
-        return torch.full_like(loss_T, 0.5)
+    def weights(self, G_KK, loss_K):
+        assert G_KK.dtype == torch.float64
+        return torch.full_like(loss_K, 0.5)
 
 
-def grads(method, scale=1.0):
-    toy = Quadratics(TERMS)
-    weighting = backward(method, toy.losses(), toy, scale)
-    return toy.shared.grad, toy.own.grad, weighting
+class ByNorm(GradientMethod):
+    """Weights that depend on the gradients and the losses."""
+
+    weighted_heads = True
+
+    def weights(self, G_KK, loss_K):
+        return loss_K / G_KK.diag().sqrt()
+
+
+class ByNormAtRepresentation(ByNorm):
+    space = "representation"
+
+
+def grads(method, scale=1.0, toy=None, **options):
+    toy = toy or Quadratics(TERMS)
+    weighting = backward(method, [[toy.forward]] * method.batches, toy, scale=scale, **options)
+    own = torch.stack([own.grad for own in toy.own.values()])
+    return toy.shared.grad, own, weighting
+
+
+class TinyNet(nn.Module):
+    """A trunk with batch norm and two decoders, one of which two losses share."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.trunk = nn.Sequential(nn.Linear(4, 8), nn.BatchNorm1d(8), nn.Tanh(), nn.Linear(8, 6))
+        self.decoders = nn.ModuleList([nn.Linear(6, 3), nn.Linear(6, 2)])
+
+    def shared_parameters(self):
+        return self.trunk.parameters()
+
+    def task_parameters(self):
+        return self.decoders.parameters()
+
+    def forward(self, x, names=tuple(term.name for term in TERMS)):
+        z = self.trunk(x)
+        z = z.view_as(z)
+        first, second = (decoder(z) for decoder in self.decoders)
+        values = [first.square().mean(), first[:, 0].abs().mean(), first[:, 1].exp().mean()]
+        values += [second.square().mean(), second.tanh().mean() + 1]
+        losses = dict(zip([term.name for term in TERMS], values, strict=True))
+        return Pass({name: losses[name] for name in names}, [z])
+
+
+def net_grads(method, parts, **options):
+    net = TinyNet()
+    backward(method, [[partial(net, x) for x in parts]], net, **options)
+    return [parameter.grad for parameter in net.parameters()]
+
+
+X = torch.randn(12, 4, generator=torch.Generator().manual_seed(5))
 
 
 def test_a_gradient_method_with_unit_weights_is_the_sum():
     for one, other in zip(grads(Sum(TERMS))[:2], grads(SumOfGradients(TERMS))[:2], strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("kind", [SumOfGradients, SumAtRepresentation])
+def test_unit_weights_in_either_space_are_ordinary_backward(kind):
+    for one, other in zip(net_grads(Sum(TERMS), [X]), net_grads(kind(TERMS), [X]), strict=True):
         torch.testing.assert_close(one, other)
 
 
@@ -44,12 +113,12 @@ def test_weighted_heads_follow_the_weights():
     full_shared, full_own, _ = grads(SumOfGradients(TERMS))
     torch.testing.assert_close(shared, 0.5 * full_shared)
     torch.testing.assert_close(own, 0.5 * full_own)
-    assert weighting.weight_T.tolist() == [0.5] * len(TERMS)
+    assert weighting.weights == {term.name: 0.5 for term in TERMS}
 
 
 def test_weights_are_the_derivatives_of_the_total():
-    method = plugins.load("methods", "fixed")(TERMS)
-    assert grads(method)[2].weight_T.tolist() == pytest.approx([1, 200, 0.01, 1, 0.001])
+    weights = grads(plugins.load("methods", "fixed")(TERMS))[2].weights
+    assert list(weights.values()) == pytest.approx([1, 200, 0.01, 1, 0.001])
 
 
 @pytest.mark.parametrize("name", ["fixed", "uncertainty", "fixed_uncertainty"])
@@ -59,20 +128,205 @@ def test_loss_scale_multiplies_every_gradient_and_no_weight(name):
     shared_scaled, own_scaled, weighting_scaled = grads(scaled, 1024.0)
     torch.testing.assert_close(shared_scaled, 1024 * shared)
     torch.testing.assert_close(own_scaled, 1024 * own)
-    torch.testing.assert_close(weighting_scaled.weight_T, weighting.weight_T)
+    assert weighting_scaled.weights == pytest.approx(weighting.weights)
     for parameter, other in zip(method.parameters(), scaled.parameters(), strict=True):
         torch.testing.assert_close(other.grad, 1024 * parameter.grad)
 
 
 def test_overflow_reaches_the_scaler_and_not_the_method():
     class Never(GradientMethod):
-        def direction(self, J_TP, loss_T):
+        def direction(self, J_KP, loss_K):
             raise AssertionError("the method saw an overflow")
 
     toy = Quadratics(TERMS)
-    losses = {name: loss * torch.inf for name, loss in toy.losses().items()}
-    backward(Never(TERMS), losses, toy)
+
+    def overflow():
+        passed = toy.forward()
+        losses = {name: loss * torch.inf for name, loss in passed.losses.items()}
+        return Pass(losses, passed.representation)
+
+    backward(Never(TERMS), [[overflow]], toy)
     assert not torch.isfinite(toy.shared.grad).all()
+
+
+# --- a batch in parts -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "kind", [Sum, Squares, SumOfGradients, ByNorm, SumAtRepresentation, ByNormAtRepresentation]
+)
+def test_parts_of_a_batch_are_the_batch(kind):
+    """Exact where the network itself is: batch norm is left out, as it has statistics by part."""
+
+    def run(parts):
+        net = TinyNet()
+        net.trunk[1] = nn.Identity()
+        backward(kind(TERMS), [[partial(net, x) for x in parts]], net)
+        return [parameter.grad for parameter in net.parameters()]
+
+    for one, other in zip(run([X]), run(X.split(4)), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_parts_with_different_labels_average_over_those_that_have_them():
+    net = TinyNet()
+    net.trunk[1] = nn.Identity()
+    parts = [partial(net, X[:6]), partial(net, X[6:], names=("semantic",))]
+    weighting = backward(Sum(TERMS), [parts], net)
+    only = TinyNet()
+    only.trunk[1] = nn.Identity()
+    other = backward(
+        SumOfGradients(TERMS),
+        [
+            [
+                partial(only, x, n)
+                for x, n in ((X[:6], [t.name for t in TERMS]), (X[6:], ["semantic"]))
+            ]
+        ],
+        only,
+    )
+    assert weighting.losses == pytest.approx(other.losses)
+    for one, two in zip(net.parameters(), only.parameters(), strict=True):
+        torch.testing.assert_close(one.grad, two.grad)
+
+
+def test_looking_at_losses_leaves_batch_norm_alone():
+    net = TinyNet()
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    losses_now([partial(net, X)], net)
+    assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
+    with frozen_statistics(net):
+        frozen = net(X).losses["center"]
+    assert torch.equal(frozen, net(X).losses["center"])  # it normalises as in training
+    assert not torch.equal(before["trunk.1.running_mean"], net.state_dict()["trunk.1.running_mean"])
+
+
+# --- losses that a batch lacks, tasks in place of terms -------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [Sum, SumOfGradients])
+def test_a_missing_task_is_as_if_the_cell_never_had_it(kind):
+    names = tuple(term.name for term in terms_of(["depth"]))
+    net, other = TinyNet(), TinyNet()
+    weighting = backward(kind(TERMS), [[partial(net, X, names)]], net)
+    backward(kind(terms_of(["depth"])), [[partial(other, X, names)]], other)
+    assert tuple(weighting.weights) == names
+    for one, two in zip(net.parameters(), other.parameters(), strict=True):
+        assert (one.grad is None) == (two.grad is None)
+        if one.grad is not None:
+            torch.testing.assert_close(one.grad, two.grad)
+
+
+def test_a_batch_without_any_labels_is_an_error():
+    with pytest.raises(ValueError, match="without labels for any"):
+        backward(Sum(TERMS), [[lambda: Pass({}, [])]], Quadratics(TERMS))
+
+
+def test_a_task_is_the_sum_of_its_terms_at_fixed_weights():
+    tasks = terms_of(["panoptic", "depth"], "tasks")
+    assert [(t.name, t.task, t.fixed_weight) for t in tasks] == [
+        ("panoptic", "panoptic", 1.0),
+        ("depth", "depth", 1.0),
+    ]
+    losses = {term.name: torch.tensor(float(i)) for i, term in enumerate(TERMS, 1)}
+    mine = gather(losses, tasks)
+    assert mine["panoptic"].item() == pytest.approx(1 + 200 * 2 + 0.01 * 3)
+    assert mine["depth"].item() == pytest.approx(4 + 0.001 * 5)
+    assert list(gather({"photometric": losses["photometric"]}, tasks)) == []
+
+
+def test_fixed_weights_over_tasks_are_fixed_weights_over_terms():
+    fixed = plugins.load("methods", "fixed")
+    tasks = terms_of(["panoptic", "depth"], "tasks")
+    for one, two in zip(net_grads(fixed(TERMS), [X]), net_grads(fixed(tasks), [X]), strict=True):
+        torch.testing.assert_close(one, two)
+
+
+# --- composition, look-ahead, cosines -------------------------------------------------------------
+
+
+def test_composition_weighs_the_rows_first():
+    uncertain = plugins.load("methods", "fixed_uncertainty")
+    alone, loss = uncertain(TERMS), uncertain(TERMS)
+    shared, own, weighting = grads(alone)
+    composed = grads(Composed(loss, SumOfGradients(TERMS)))
+    torch.testing.assert_close(composed[0], shared)
+    torch.testing.assert_close(composed[1], own)
+    assert composed[2].weights == pytest.approx(weighting.weights)
+    torch.testing.assert_close(loss.log_variance_T.grad, alone.log_variance_T.grad)
+
+
+def test_composition_with_a_missing_task():
+    names = tuple(term.name for term in terms_of(["depth"]))
+    uncertain, net, other = plugins.load("methods", "fixed_uncertainty"), TinyNet(), TinyNet()
+    composed = Composed(uncertain(TERMS), SumOfGradients(TERMS))
+    weighting = backward(composed, [[partial(net, X, names)]], net)
+    backward(uncertain(TERMS), [[partial(other, X, names)]], other)
+    assert tuple(weighting.weights) == names
+    for one, two in zip(net.trunk.parameters(), other.trunk.parameters(), strict=True):
+        torch.testing.assert_close(one.grad, two.grad)
+
+
+def test_composition_travels_in_a_checkpoint():
+    first = Composed(plugins.load("methods", "uncertainty")(TERMS), SumOfGradients(TERMS, seed=3))
+    with torch.no_grad():
+        first.loss.log_variance_T.fill_(0.5)
+    second = Composed(plugins.load("methods", "uncertainty")(TERMS), SumOfGradients(TERMS, seed=4))
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(second.loss.log_variance_T, first.loss.log_variance_T)
+    drawn = [m.gradient.generator.get_state() for m in (first, second)]
+    assert torch.equal(*drawn)
+
+
+def test_independent_batches_are_compared_in_the_losses_that_all_have():
+    class Last(GradientMethod):
+        batches = 3
+
+        def direction(self, J_NKP, loss_NK):
+            assert J_NKP.shape[:2] == loss_NK.shape == (3, 2)
+            assert self.present.tolist() == [0, 4]
+            return J_NKP[2].sum(0), torch.ones(2)
+
+    net, names = TinyNet(), [term.name for term in TERMS]
+    lists = (names, [names[0], names[4]], names[:1] + names[3:])
+    batches = [[partial(net, X, some)] for some in lists]
+    weighting = backward(Last(TERMS), batches, net)
+    assert list(weighting.weights) == ["semantic", "smoothness"]
+    one_batch = TinyNet()
+    backward(SumOfGradients(TERMS), [[partial(one_batch, X, lists[1])]], one_batch)
+    for one, two in zip(net.parameters(), one_batch.parameters(), strict=True):
+        torch.testing.assert_close(one.grad, two.grad)
+    with pytest.raises(ValueError, match="share no labels"):
+        backward(Last(TERMS), [[partial(net, X, names[i : i + 1])] for i in range(3)], net)
+
+
+def test_look_ahead_sees_the_moved_point_and_leaves_it():
+    class Looks(LookAheadMethod):
+        def direction_ahead(self, J_KP, loss_K, ahead, lr):
+            direction_P = J_KP.sum(0)
+            self.there = ahead(direction_P), lr
+            return direction_P, torch.ones_like(loss_K)
+
+    toy, method = Quadratics(TERMS), Looks(TERMS)
+    point = toy.shared.detach().clone()
+    shared, _, _ = grads(method, toy=toy, lr=0.1)
+    assert torch.equal(toy.shared, point)
+    targets = torch.stack([toy.target[term.name] for term in TERMS])
+    expected = 2 * (point - 0.1 * shared - targets) / len(point)
+    torch.testing.assert_close(method.there[0], expected)
+    assert method.there[1] == 0.1
+
+
+@pytest.mark.parametrize("kind", [Sum, SumOfGradients])
+def test_cosines_are_those_of_the_gradients(kind):
+    toy = Quadratics(TERMS)
+    rows = [torch.autograd.grad(v, toy.shared)[0] for v in toy.forward().losses.values()]
+    plain = grads(kind(TERMS))
+    shared, _, weighting = grads(kind(TERMS), cosines=True)
+    assert len(weighting.cosines) == 10
+    expected = torch.cosine_similarity(rows[0], rows[3], dim=0).item()
+    assert weighting.cosines["semantic.photometric"] == pytest.approx(expected, abs=1e-6)
+    torch.testing.assert_close(shared, plain[0])  # measuring changes nothing
 
 
 # Reference values: section "uncertainty total" of MGNet's public code, computed with it.

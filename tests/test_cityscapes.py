@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from cityscapes_tree import (
     file,
     instance_ids,
     open_tree,
+    put_ego_mask,
     put_png,
     write_frame,
     write_tree,
@@ -18,7 +20,7 @@ from cityscapes_tree import (
 
 from mtl_bench import config
 from mtl_bench.data.check import check
-from mtl_bench.data.cityscapes_files import read_instance_ids
+from mtl_bench.data.cityscapes_files import neighbour, read_instance_ids, unlabelled_names
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE
 from mtl_bench.data.targets import panoptic_targets
 
@@ -215,6 +217,149 @@ def test_labelled_sequence_frames_join_the_training(tree, tmp_path_factory):
     assert later.K_B33[0, 0].item() == pytest.approx(2262.52)
     human = dataset.sample(1, generator())
     assert (human.semantic_BHW == CITYSCAPES20.index("car")).any()
+    assert dataset.reprojection_mask == "labels"
+
+
+def test_every_frame_of_a_video_data_set_has_neighbours(tmp_path):
+    """Also where snippets have no room at their ends, or labels where there is no image."""
+    for number, frames in enumerate((range(15, 24), range(18, 21), range(17, 20))):
+        stem = f"aachen_{number:06d}"
+        write_frame(tmp_path, f"{stem}_000019")
+        for frame in frames:
+            image = np.full((HEIGHT, WIDTH, 3), frame, np.uint8)
+            name = f"{stem}_{frame:06d}"
+            put_png(file(tmp_path, "leftImg8bit_sequence", name, "leftImg8bit.png"), image)
+        for frame in range(10, 28):
+            path = tmp_path / f"pseudo/aachen/{stem}_{frame:06d}_gtFine_instanceIds.png"
+            put_png(path, np.full((HEIGHT, WIDTH), 7, np.uint16))
+    dataset = open_tree(tmp_path, sequence_labels=tmp_path / "pseudo", augment=PLAIN)
+    assert [name[7:] for name in dataset.names] == [
+        *(f"000000_{frame:06d}" for frame in range(16, 23)),
+        "000001_000019",
+        "000002_000018",
+        "000002_000019",
+    ]
+    assert [name for name in dataset.names if not name.endswith("19")] == unlabelled_names(
+        tmp_path, "train"
+    )
+    for index, name in enumerate(dataset.names):
+        sample = dataset.sample(index, generator())
+        for place, step in enumerate((-1, 1)):
+            path = file(tmp_path, "leftImg8bit_sequence", neighbour(name, step), "leftImg8bit.png")
+            assert torch.equal(sample.context_BN3HW[place], rgb(path))
+
+
+# --- without labels -------------------------------------------------------------------------------
+
+
+def test_depth_trains_without_labels_and_panoptic_does_not(tree):
+    shutil.rmtree(tree / "gtFine")
+    depth = open_tree(tree, panoptic=False)
+    assert (depth.reprojection_mask, depth.needs_automask) == ("none", True)
+    for index in range(len(depth)):
+        sample = depth.sample(index, generator(index))
+        assert sample.reprojection_mask_BHW.all()
+        assert sample.context_BN3HW.shape == (2, 3, HEIGHT, WIDTH)
+    for video in (True, False):
+        with pytest.raises(ValueError, match="missing, one of 3 label files") as error:
+            open_tree(tree, video=video)
+        assert one_line(error)
+
+
+def test_panoptic_alone_needs_no_video_at_all(tree):
+    shutil.rmtree(tree / "leftImg8bit_sequence")
+    dataset = open_tree(tree, video=False)
+    assert dataset.reprojection_mask == "labels"
+    sample = dataset.sample(0, generator())
+    assert sample.semantic_BHW is not None
+    for name in ("context_BN3HW", "clean_B3HW", "clean_context_BN3HW", "reprojection_mask_BHW"):
+        assert getattr(sample, name) is None
+    with pytest.raises(ValueError, match="missing, one of 6 neighbour frames"):
+        open_tree(tree)
+
+
+def test_ego_mask_goes_through_the_augmentation(tree):
+    shutil.rmtree(tree / "gtFine")
+    ego = put_ego_mask(tree)
+    dataset = open_tree(tree, panoptic=False, augment=PLAIN)
+    assert (dataset.reprojection_mask, dataset.needs_automask) == ("ego_mask.png", True)
+    assert np.array_equal(dataset.sample(0, generator()).reprojection_mask_BHW.numpy(), ~ego)
+
+    for path in tree.rglob("*_leftImg8bit.png"):  # so that the image says what the mask must be
+        put_png(path, np.where(ego, 255, 0)[..., None].repeat(3, 2).astype(np.uint8))
+    settings = config.Augment(
+        crop=(HEIGHT - 4, WIDTH + 4), brightness=0, contrast=0, saturation=0, hue=0
+    )
+    dataset = open_tree(tree, panoptic=False, augment=settings)
+    flipped = 0
+    for seed in range(12):
+        sample = dataset.sample(0, generator(seed))
+        black = (sample.image_B3HW == 0).all(0)  # padding is gray
+        assert torch.equal(sample.reprojection_mask_BHW, black)
+        flipped += bool(sample.reprojection_mask_BHW[-1].int().argmax() < WIDTH // 2)
+    assert 0 < flipped < 12
+
+
+def test_ego_mask_is_for_frames_without_labels(tree):
+    ego = put_ego_mask(tree)
+    labelled = np.isin(instance_ids(), [1, 23])
+    dataset = open_tree(tree, augment=PLAIN)
+    assert (dataset.reprojection_mask, dataset.needs_automask) == ("labels", False)
+    assert np.array_equal(dataset.sample(0, generator()).reprojection_mask_BHW.numpy(), ~labelled)
+
+    file(tree, "gtFine", NAME, "gtFine_instanceIds.png").unlink()
+    dataset = open_tree(tree, augment=PLAIN, panoptic=False)
+    assert dataset.reprojection_mask == "labels, or ego_mask.png where a frame lacks them"
+    assert dataset.needs_automask
+    masks = [dataset.sample(index, generator()).reprojection_mask_BHW.numpy() for index in (0, 1)]
+    assert np.array_equal(masks[0], ~ego)
+    assert np.array_equal(masks[1], ~labelled)
+
+    (tree / "ego_mask.png").unlink()
+    dataset = open_tree(tree, augment=PLAIN, panoptic=False)
+    assert dataset.reprojection_mask == "labels, or none where a frame lacks them"
+
+
+def test_ego_mask_shrinks_with_the_frames(tmp_path):
+    size = (3 * HEIGHT, 2 * WIDTH)
+    write_frame(tmp_path, NAME, size=size)
+    shutil.rmtree(tmp_path / "gtFine")
+    put_ego_mask(tmp_path, size)
+    sample = open_tree(tmp_path, panoptic=False, augment=PLAIN).sample(0, generator())
+    small = np.zeros((HEIGHT, WIDTH), bool)
+    small[HEIGHT // 2 :, : WIDTH // 2] = True
+    assert np.array_equal(sample.reprojection_mask_BHW.numpy(), ~small)
+
+
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (np.zeros((HEIGHT, WIDTH), np.uint16), "16-bit PNG where 8"),
+        (np.zeros((HEIGHT, WIDTH, 3), np.uint8), "3 channels where one is expected"),
+        (np.zeros((8, 9), np.uint8), "8x9 pixels, but aachen_000000_000019_leftImg8bit.png has"),
+    ],
+)
+def test_wrong_ego_mask(tree, mask, message):
+    put_png(tree / "ego_mask.png", mask)
+    assert check(tree).problems == []  # not in use
+    open_tree(tree).sample(0, generator())
+    shutil.rmtree(tree / "gtFine")
+    with pytest.raises(ValueError, match=f"{tree}/ego_mask.png: {message}") as error:
+        open_tree(tree, panoptic=False).sample(0, generator())
+    assert one_line(error)
+    assert open_tree(tree, panoptic=False, augment=None).sample(0, None).depth_m_BHW is not None
+    report = check(tree)
+    assert [str(problem) for problem in report.problems] == [str(error.value)]
+    assert report.obstacle("depth training") == "1 problem"
+    assert "train: 1 bad ego mask" in report.summary()
+
+
+def test_a_folder_with_videos_alone_says_what_is_missing(tree):
+    shutil.rmtree(tree / "leftImg8bit")
+    for look in (lambda root: open_tree(root, panoptic=False), check):
+        with pytest.raises(ValueError, match=r"leftImg8bit/train: no .* in it; expected") as error:
+            look(tree)
+        assert one_line(error)
 
 
 # --- what can be wrong ----------------------------------------------------------------------------
@@ -403,7 +548,31 @@ def test_check_of_a_sound_tree(tree):
         "depth training: ready",
         "panoptic evaluation: ready",
         "depth evaluation: ready",
+        "pseudo labels: 0 training frames could get them",
     ]
+
+
+def test_check_says_what_can_be_done_without_labels(tree):
+    for frame in (17, 21, 22):
+        name = f"aachen_000000_{frame:06d}"
+        image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        put_png(file(tree, "leftImg8bit_sequence", name, "leftImg8bit.png"), image)
+    assert check(tree).summary()[-1] == "pseudo labels: 3 training frames could get them"
+
+    shutil.rmtree(tree / "gtFine")
+    assert check(tree).summary()[2:] == [
+        "val: none",
+        "panoptic training: no gtFine/train; unpack gtFine_trainvaltest.zip",
+        "depth training: ready",
+        "panoptic evaluation: no frames in leftImg8bit/val",
+        "depth evaluation: no frames in leftImg8bit/val",
+        "without labels: only depth can be trained",
+        "reprojection mask: none, with the auto-mask; ego_mask.png would mask the ego vehicle",
+        "pseudo labels: 6 training frames could get them",
+    ]
+    put_ego_mask(tree)
+    lines = check(tree).summary()
+    assert "reprojection mask: ego_mask.png, with the auto-mask" in lines
 
 
 def test_check_lists_everything_at_once(tree):

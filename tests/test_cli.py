@@ -15,7 +15,8 @@ from mtl_bench import launch, plugins, provenance, results
 from mtl_bench.cli import app
 from mtl_bench.commands import grid as grid_commands
 from mtl_bench.commands import options
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.config import TASKS, Cell, load_recipe
+from mtl_bench.grids import load_grid
 
 GRID = """question = "Does it work?"
 recipe = "smoke"
@@ -93,7 +94,7 @@ def test_new_in_a_folder_and_check_by_file(tmp_path):
     path = tmp_path / "place" / "mine.py"
     assert "mine" not in call("list", "methods")
     assert "Mine: one line" in call("list", "methods", "--plugins", "place")
-    path.write_text(path.read_text().replace("self.fixed_T * loss_T", "loss_T * float('nan')"))
+    path.write_text(path.read_text().replace("fixed_K * loss_K", "loss_K * float('nan')"))
     assert "FAILED" in call("check", path, code=1)
     assert "is no name" in one_line("new", "method", "Not-A-Name")
 
@@ -193,6 +194,7 @@ def ablate(tmp_path, monkeypatch):
 
     def build(grid, rows, out_dir, **given):
         built.append((grid.name, [row["status"] for row in rows], out_dir))
+        run.rows = rows
         return out_dir / "index.html"
 
     monkeypatch.setattr("mtl_bench.report.build", build)
@@ -202,7 +204,7 @@ def ablate(tmp_path, monkeypatch):
         monkeypatch.setattr(launch, "cell_command", lambda cell, *given: command(cell))
         return call("ablate", "--grid", "mine.toml", *words, code=code)
 
-    run.runs, run.built = runs, built
+    run.runs, run.built, run.rows = runs, built, []
     return run
 
 
@@ -258,6 +260,82 @@ def test_report_of_what_there_is(ablate):
     assert call("report", "--grid", "mine.toml") == "reports/mine/index.html\n"
 
 
+ROWS = (
+    GRID.split("method =")[0]
+    + """
+[[row]]
+name = "Apart"
+method = "fixed"
+single_task = true
+
+[[row]]
+name = "Uncertain"
+method = "fixed_uncertainty"
+
+[[row]]
+name = "Longer"
+method = "fixed_uncertainty"
+video = true
+
+[baseline]
+method = "fixed"
+single_task = true
+
+[report]
+rows = "name"
+"""
+)
+
+
+def test_what_cells_need_is_announced_run_and_listed_but_in_no_row(ablate, tmp_path):
+    (tmp_path / "mine.toml").write_text(ROWS)
+    text = ablate("--dry-run")
+    assert "3 cells and 2 that they need = 1 backbone x 3 rows, less 0 skipped" in text
+    assert "missing 5   to run 5" in text
+    assert "3 of 3 cells done" in ablate("--jobs", "2")
+    assert len(history(ablate.runs)) == 10
+    assert [row["name"] for row in ablate.rows] == ["Apart", "Uncertain", "Longer"]
+    lines = call("status", "--grid", "mine.toml").splitlines()
+    assert [("needed by another" in line) for line in lines] == [True, True, *[False] * 4]
+    assert "Uncertain" in lines[3]
+    assert lines[5] == "done 5"
+
+
+def test_a_failed_parent_is_told_and_exits_1(ablate, tmp_path):
+    (tmp_path / "mine.toml").write_text(ROWS)
+    grid = load_grid("mine.toml")
+    parent = grid.cells[0].parents[0]
+    text = ablate(actions={parent.id: "fail"}, code=1)
+    assert f"NOT RUN  needs {parent.slug}, which is failed (ValueError: on purpose)" in text
+    assert "2 of 3 cells done" in text
+    assert [row["status"] for row in ablate.rows] == ["missing", "done", "done"]
+    assert "NOT RUN" in ablate("--quiet", actions={parent.id: "fail"}, code=1)
+    ablate()
+
+
+def test_rows_carry_their_delta_to_the_stored_baseline(ablate, tmp_path):
+    axes, _, row, longer = ROWS.split("[[row]]")
+    text = f"{axes}[[row]]{row}{longer[longer.index('[baseline]') :]}"
+    (tmp_path / "mine.toml").write_text(text)
+    ablate()
+    (row,) = ablate.rows
+    assert "delta.flat" not in row["metric"]
+    numbers = {"panoptic.pq": 20.0, "semantic.miou": 40.0, "depth_median.abs_rel": 0.2}
+    numbers |= {"depth_median.rmse": 8.0, "depth_median.delta1": 0.8}
+    cell = load_grid("mine.toml").cells[0]
+    apart = Cell(cell.recipe, "tiny", "fixed", single_task=True)
+    for each, factor in ((cell, 1.1), (apart, 1.0)):
+        directory = results.run_dir(each, ablate.runs)
+        directory.mkdir(exist_ok=True)
+        metric = {key: value * factor for key, value in numbers.items()}
+        row = {"code": provenance.code(each), "metric": metric}
+        results.write_json(directory / "row.json", row)
+    call("report", "--grid", "mine.toml")
+    # three of five metrics are a tenth better, two worse; of depth one and two; flat is a loss
+    assert ablate.rows[0]["metric"]["delta.flat"] == pytest.approx(-2.0)
+    assert ablate.rows[0]["metric"]["delta.task"] == pytest.approx((10 - 10 / 3) / 2)
+
+
 # --- one cell -------------------------------------------------------------------------------------
 
 CELL = ("--recipe", "smoke", "--backbone", "tiny", "--method", "fixed", "--tasks", "depth")
@@ -295,6 +373,49 @@ def test_train_makes_the_cell_that_the_options_say(train):
     assert "done already" in train(file)
     train(file, "--rerun")
     assert train.seen[1][0] == cell
+
+
+def test_train_options_name_a_cell_of_any_kind(train):
+    train(*CELL[:-2], "--granularity", "tasks", "--set", "method.weights.panoptic=2.5")
+    cell = train.seen[0][0]
+    assert (cell.granularity, cell.method_args) == ("tasks", {"weights": {"panoptic": 2.5}})
+    assert "no granularity 'task' (did you mean 'tasks'?)" in one_line(
+        "train", *CELL, "--granularity", "task"
+    )
+    assert "exclude each other" in one_line("train", *CELL[:-2], "--video", "--single-task")
+
+
+def test_train_runs_what_the_cell_needs_first(train):
+    text = train(*CELL[:-2], "--single-task")
+    assert "fixed tiny s0 single-task needs fixed tiny s0 panoptic first" in text
+    assert [cell.tasks for cell, *_ in train.seen] == [("panoptic",), ("depth",), TASKS]
+    for cell, *_ in train.seen:
+        assert results.status(cell, Path("runs")) == "done"
+    train(*CELL[:-2], "--single-task", "--rerun")
+    assert len(train.seen) == 4  # not its parents
+    assert "needs" not in train(*CELL)
+
+
+def test_train_stops_at_a_parent_that_fails_and_leaves_the_child_alone(train):
+    def fail(directory):
+        raise ValueError("on purpose")
+
+    train.behave = fail
+    assert "on purpose" in train(*CELL[:-2], "--video", code=2)
+    cell = Cell(load_recipe("smoke"), "tiny", "fixed", video=True)
+    assert results.status(cell.parents[0], Path("runs")) == "failed"
+    assert results.status(cell, Path("runs")) == "missing"
+    train.behave = lambda directory: None
+    train(*CELL[:-2], "--video")
+    assert results.status(cell, Path("runs")) == "done"
+
+
+def test_train_does_not_build_on_a_stale_parent(train, monkeypatch):
+    train(*CELL[:-2])
+    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "changed")
+    text = one_line("train", *CELL[:-2], "--video")
+    assert "is stale, harness changed: mtl-bench train runs/fixed-tiny-s0-" in text
+    assert len(train.seen) == 1
 
 
 def test_train_writes_down_why_it_failed(train):

@@ -97,7 +97,7 @@ def test_recipes_load_and_differ():
     assert {"smoke", "small", "medium", "cityscapes"} <= set(names)
     recipes = [config.load_recipe(name) for name in names]
     assert len({replace(CELL, recipe=recipe).id for recipe in recipes}) == len(names)
-    assert [recipe.name for recipe in recipes if recipe.smoke] == ["smoke"]
+    assert [recipe.name for recipe in recipes if recipe.smoke] == ["cost", "smoke"]
     assert all(recipe.about for recipe in recipes)
 
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,11 +22,12 @@ def cells(count):
 
 
 def fake(runs, action="ok", seconds=0.0, actions=None):
-    """A command that behaves as told, for some seeds otherwise."""
+    """A command that behaves as told, for some seeds (or cells, by id) otherwise."""
+    actions = actions or {}
 
     def command(cell):
         code = json.dumps(provenance.code(cell))
-        chosen = (actions or {}).get(cell.seed, action)
+        chosen = actions.get(cell.id, actions.get(cell.seed, action))
         file = results.run_dir(cell, runs) / "cell.json"
         return [sys.executable, str(FAKE), chosen, str(seconds), code, str(file)]
 
@@ -165,6 +167,85 @@ def test_a_cell_whose_process_died_is_taken_over(tmp_path):
     other.wait()
 
 
+# --- cells that need others -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def video():
+    """A video cell and, before it, its parent."""
+    child = Cell(Recipe(), "tiny", "fixed", video=True)
+    return [*child.parents, child]
+
+
+def test_parents_are_run_before_their_children_each_once(tmp_path):
+    plain = Cell(Recipe(), "tiny", "fixed")
+    own = [replace(plain, single_task=True), plain, replace(plain, video=True)]
+    todo = launch.to_run(own, tmp_path)
+    assert [cell.tasks for cell in todo[:2]] == [("panoptic",), ("depth",)]
+    assert todo[2:] == own
+    assert run(todo, tmp_path, jobs=2, seconds=0.3) == ["done"] * 5
+    times = {(word, slug): when for word, slug, when, _ in history(tmp_path)}
+    assert len(history(tmp_path)) == len(times) == 10
+    for cell in own:
+        for parent in cell.parents:
+            assert times["end", parent.slug] <= times["start", cell.slug]
+
+
+def test_a_waiting_child_keeps_nobody_from_running_and_keeps_its_place(tmp_path, video):
+    parent, child = video
+    others = cells(4)[1:]
+    assert run([parent, child, *others], tmp_path, jobs=2, seconds=0.5) == ["done"] * 5
+    starts = [slug for word, slug, *_ in history(tmp_path) if word == "start"]
+    assert set(starts[:2]) == {parent.slug, others[0].slug}
+    assert child.slug in starts[2:4]
+
+
+def test_what_a_done_cell_needed_is_not_run_again(tmp_path, video):
+    parent, child = video
+    run(video, tmp_path)
+    (tmp_path / parent.slug / "row.json").unlink()
+    assert launch.to_run([child], tmp_path) == []
+    assert launch.to_run([child], tmp_path, "all") == video
+    assert launch.to_run(video, tmp_path) == [parent]
+
+
+def test_a_failed_parent_leaves_its_child_missing(tmp_path, video, capsys):
+    parent, child = video
+    other = cells(2)[1]
+    words = run([*video, other], tmp_path, actions={parent.id: "fail"})
+    assert words == ["failed", "missing", "done"]
+    line = f"NOT RUN  needs {parent.slug}, which is failed (ValueError: on purpose)"
+    assert line in capsys.readouterr().out  # quiet or not
+    assert not (tmp_path / child.slug).exists()
+    assert launch.to_run([child], tmp_path) == video
+    assert run(video, tmp_path) == ["done", "done"]
+
+
+def test_a_stale_parent_is_not_used(tmp_path, video, monkeypatch, capsys):
+    parent, child = video
+    run([parent], tmp_path)
+    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "changed")
+    assert launch.to_run([child], tmp_path) == [child]
+    assert run([child], tmp_path) == ["missing"]
+    line = f"needs {parent.slug}, which is stale (harness changed; --rerun stale)"
+    assert line in capsys.readouterr().out
+    assert launch.to_run([child], tmp_path, "stale") == video
+    assert run(video, tmp_path, rerun="stale") == ["done", "done"]
+
+
+@pytest.mark.parametrize(("action", "words"), [("ok", ["done"]), ("fail", ["missing"])])
+def test_a_parent_that_another_process_runs_is_waited_for(tmp_path, video, action, words):
+    parent, child = video
+    directory = tmp_path / parent.slug
+    directory.mkdir()
+    other = subprocess.Popen(fake(tmp_path, action, 0.8)(parent))
+    wait_for(lambda: claim.claimed_by(directory) is not None)
+    assert run([child], tmp_path) == words
+    other.wait()
+    starts = [slug for word, slug, *_ in history(tmp_path) if word == "start"]
+    assert starts == [parent.slug, child.slug][: 1 + (action == "ok")]
+
+
 LAUNCH = """
 import json, signal, sys
 from pathlib import Path
@@ -276,9 +357,11 @@ def test_time_left_is_from_the_pace_in_this_stage(monkeypatch):
 
 def test_labels_tell_cells_apart():
     plain = Cell(Recipe(), "net", "way")
-    other = Cell(Recipe(), "net", "way", ("depth",), 2, True, method_args={"init": 0.5})
+    other = Cell(Recipe(), "net", "way", ("panoptic",), 2, True, method_args={"init": 0.5})
     assert label(plain) == "way net s0"
-    assert label(other) == "way net s2 depth video init=0.5"
+    assert label(other) == "way net s2 panoptic video init=0.5"
+    apart = Cell(Recipe(), "net", "way", single_task=True, granularity="tasks")
+    assert label(apart) == "way net s0 single-task by tasks"
 
 
 def test_durations_and_headlines():
@@ -289,6 +372,7 @@ def test_durations_and_headlines():
 
 def test_expected_hours_come_from_the_cells_that_are_done(tmp_path):
     todo = cells(3)
-    assert launch.hours_to_run(3, todo, tmp_path) is None
+    assert launch.hours_to_run(todo, todo, tmp_path) is None
     run(todo[:1], tmp_path)  # the stand-in claims one hour
-    assert launch.hours_to_run(2, todo, tmp_path) == pytest.approx(2.0)
+    apart = replace(todo[0], single_task=True)  # nothing is trained for it but its parents
+    assert launch.hours_to_run([*todo[1:], apart], todo, tmp_path) == pytest.approx(2.0)

@@ -17,12 +17,22 @@ LINES = 300
 
 # A module imports only from rooms before its own (or from its own).
 ORDER = (
-    *("plain", "config", "plugins", "provenance", "data", "geometry", "depth_scale"),
-    *("model", "postprocess", "losses", "method", "backward", "engine"),
-    *("checkpoint", "curve", "progress", "tracking", "train"),
-    *("metrics", "evaluate", "baselines", "export_predictions", "latency"),
+    *("plain", "config", "plugins", "cards", "provenance", "data", "geometry", "depth_scale"),
+    *("model", "postprocess", "losses", "method", "gradients", "backward", "engine"),
+    *("checkpoint", "curve", "quiet", "progress", "tracking", "train"),
+    *("metrics", "evaluate", "pseudo_labels", "baselines", "export_predictions", "latency"),
     *("claim", "results", "run", "check"),
-    *("grids", "display", "launch", "report", "scaffold", "commands", "cli", "__main__"),
+    *(
+        "toml_file",
+        "grids",
+        "display",
+        "launch",
+        "report",
+        "scaffold",
+        "commands",
+        "cli",
+        "__main__",
+    ),
 )
 
 # The pose network's encoder is the paper's, whatever the backbone is.

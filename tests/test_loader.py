@@ -44,6 +44,22 @@ def test_batches_are_stacked(tree):
     assert batch.image_B3HW.is_contiguous()
 
 
+def test_a_batch_splits_into_consecutive_parts(tree):
+    (batch,) = take(open_tree(tree), 1, batch_size=6)
+    for size in (1, 2, 3, 6):
+        parts = batch.split(size)
+        assert [len(part.names) for part in parts] == [size] * (6 // size)
+        assert [name for part in parts for name in part.names] == batch.names
+        for field in dataclasses.fields(batch):
+            values = [getattr(part, field.name) for part in parts]
+            if isinstance(values[0], torch.Tensor):
+                assert torch.equal(torch.cat(values), getattr(batch, field.name)), field.name
+    assert batch.split(2)[1].depth_m_BHW is None
+    for size in (4, 0, 7, -2):
+        with pytest.raises(ValueError, match=rf"micro_batch = {size} does not divide a batch of 6"):
+            batch.split(size)
+
+
 def test_any_step_can_be_the_first(tree):
     dataset = open_tree(tree)
     batches = take(dataset, 6)

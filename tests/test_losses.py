@@ -11,7 +11,7 @@ from mtl_bench import config, geometry
 from mtl_bench.data.batch import Batch
 from mtl_bench.losses import TERMS, loss_terms, terms_of
 from mtl_bench.losses.instance import center_loss, offset_loss
-from mtl_bench.losses.photometric import View, photometric_loss
+from mtl_bench.losses.photometric import photometric_loss
 from mtl_bench.losses.semantic import semantic_loss
 from mtl_bench.losses.smoothness import smoothness_loss
 from mtl_bench.losses.ssim import PhotometricError
@@ -490,30 +490,12 @@ def test_automask_switch_reaches_the_loss() -> None:
     assert masked.item() < plain.item()
 
 
-def test_a_level_of_the_pyramid_is_a_smaller_camera() -> None:
-    """A small pixel lies in the middle of the pixels that it replaces."""
-    scene = Scene()
-    view = View(scene.target, scene.context, [scene.inverse], scene.K, scene.mask)
-    assert view.at_level(0) is view
-    small = view.at_level(1)
-    height, width = scene.target.shape[2:]
-    assert small.target_B3HW.shape[2:] == (height // 2, width // 2)
-    assert small.context_BN3HW.shape[3:] == (height // 2, width // 2)
-    mean = scene.target[:, :, 2:4, 4:6].mean((2, 3))
-    torch.testing.assert_close(small.target_B3HW[:, :, 1, 2], mean)
-    point = torch.tensor([[0.3], [0.2], [2.0]], dtype=scene.K.dtype)
-    x, y, z = (scene.K[0] @ point).squeeze(1)
-    x_small, y_small, z_small = (small.K_B33[0] @ point).squeeze(1)
-    assert float(x_small / z_small) == pytest.approx(float((x / z + 0.5) / 2 - 0.5))
-    assert float(y_small / z_small) == pytest.approx(float((y / z + 0.5) / 2 - 0.5))
-
-
-def test_a_small_pixel_counts_where_most_of_what_it_replaces_does() -> None:
-    scene = Scene()
-    scene.mask = torch.ones_like(scene.mask)
-    scene.mask[:, :2, :2] = False
-    scene.mask[:, 0, 4] = False
-    view = View(scene.target, scene.context, [scene.inverse], scene.K, scene.mask)
-    mask = view.at_level(1).mask_BHW
-    assert not mask[:, 0, 0].any()
-    assert mask[:, 0, 2].all()
+def test_a_task_without_labels_or_neighbours_has_no_terms() -> None:
+    batch, outputs, transforms = make_batch()
+    batch.semantic_BHW = None
+    losses = loss_terms(batch, outputs, transforms, config.Loss(), TASKS)
+    assert list(losses) == ["photometric", "smoothness"]
+    batch, outputs, _ = make_batch()
+    batch.clean_context_BN3HW = None
+    losses = loss_terms(batch, outputs, None, config.Loss(), TASKS)
+    assert list(losses) == ["semantic", "center", "offset"]

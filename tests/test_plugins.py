@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -172,19 +173,40 @@ def test_helpers_belong_to_their_folder(tmp_path):
     assert "_common" not in plugins.files("methods")
 
 
-def test_fingerprint_covers_file_and_helpers_and_nothing_else(tmp_path):
+def test_fingerprint_covers_the_file_and_the_helpers_that_it_imports(tmp_path):
     path = put(tmp_path / "methods" / "mine.py")
+    helper = put(tmp_path / "methods" / "_common.py", "x = 1\n")
+    below = put(tmp_path / "methods" / "_below.py", "y = 1\n")
     before = plugins.fingerprint("methods", "mine")
     assert len(before) == 12
     put(tmp_path / "methods" / "neighbour.py")
-    assert plugins.fingerprint("methods", "mine") == before
-    helper = put(tmp_path / "methods" / "_common.py", "x = 1\n")
-    with_helper = plugins.fingerprint("methods", "mine")
     helper.write_text("x = 2\n")
-    assert len({before, with_helper, plugins.fingerprint("methods", "mine")}) == 3
-    helper.unlink()
-    path.write_text(METHOD + "# a change\n")
-    assert plugins.fingerprint("methods", "mine") != before
+    assert plugins.fingerprint("methods", "mine") == before  # it imports neither
+    path.write_text("from ._common import x\n" + METHOD)
+    importing = plugins.fingerprint("methods", "mine")
+    helper.write_text("from ._below import y\nx = 3\n")
+    changed = plugins.fingerprint("methods", "mine")
+    below.write_text("y = 2\n")
+    assert len({before, importing, changed, plugins.fingerprint("methods", "mine")}) == 4
+
+
+def test_a_composition_is_both_files(tmp_path):
+    assert plugins.part_names("mine") == ["mine"]
+    first = put(tmp_path / "methods" / "first.py")
+    second = put(tmp_path / "methods" / "second.py")
+    prints = [plugins.fingerprint("methods", "first+second")]
+    for path in (first, second):
+        path.write_text(METHOD + "# a change\n")
+        prints.append(plugins.fingerprint("methods", "first+second"))
+    assert len(set(prints)) == 3
+    cell = Cell(Recipe(), "tiny", "first+second", method_args={"second": {"factor": 1.0}})
+    plugins.check_cells([cell])
+    for values, message in (
+        ({"third": {}}, "has no part 'third'"),
+        ({"second": {"factr": 1.0}}, "did you mean 'factor'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plugins.check_cells([replace(cell, method_args=values)])
 
 
 def test_an_edited_file_is_loaded_anew(tmp_path):

@@ -1,11 +1,14 @@
 """The README's examples are run, and its generated parts are the reference report's."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from mtl_bench.check import check
+from mtl_bench.report import readme
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
@@ -19,9 +22,9 @@ def test_example_passes_the_checks(kind, name, marker, tmp_path, monkeypatch):
     (source,) = [example for example in EXAMPLES if marker in example]
     folder = tmp_path / kind
     folder.mkdir()
-    (folder / f"{name}.py").write_text(source)
+    (folder / f"readme_{name}.py").write_text(source)  # the example may ship under its own name
     monkeypatch.setenv("MTL_BENCH_PLUGINS", str(tmp_path))
-    failed = [f"{r.name}: {r.detail}" for r in check(kind, name) if not r.ok]
+    failed = [f"{r.name}: {r.detail}" for r in check(kind, f"readme_{name}") if not r.ok]
     assert failed == []
 
 
@@ -30,11 +33,52 @@ def test_every_linked_file_exists():
         assert (README.parent / target).exists(), target
 
 
-def test_the_results_are_the_reference_reports(tmp_path):
-    report = README.parent / "reports" / "backbones"
-    table = (report / "table.md").read_text(encoding="utf-8").rstrip("\n")
-    section = re.search(
-        r"<!-- results:backbones -->\n(.*?)<!-- /results -->", README.read_text("utf-8"), re.DOTALL
+@pytest.mark.parametrize("name", readme.names(README))
+def test_the_results_are_the_reference_reports(name):
+    text = readme.filled(README, name, README.parent / "reports" / name)
+    assert text == README.read_text("utf-8"), "make readme"
+
+
+def test_a_command_fills_in_all_results(tmp_path):
+    path = tmp_path / "README.md"
+    blocks = "".join(f"<!-- results:{name} -->\nold\n<!-- /results -->\n" for name in "ab")
+    path.write_text(f"# Title\n{blocks}end\n")
+    command = [
+        sys.executable,
+        "-m",
+        "mtl_bench.report.readme",
+        str(path),
+        str(tmp_path / "reports"),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: no ")
+    for name in "ab":
+        (tmp_path / "reports" / name).mkdir(parents=True)
+        (tmp_path / "reports" / name / "table.md").write_text(f"table of {name}\n")
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "a: updated\nb: updated\n"
+    text = path.read_text()
+    assert (
+        text.index("table of a") < text.index("(reports/a/index.html)") < text.index("table of b")
     )
-    assert section is not None
-    assert section[1].strip().startswith(table)
+    assert "old" not in text
+    assert text.endswith("<!-- /results -->\nend\n")
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "a: as it was\nb: as it was\n"
+
+
+def test_a_grid_chooses_its_pictures(tmp_path, monkeypatch):
+    monkeypatch.setattr(readme, "GRIDS", tmp_path)
+    (tmp_path / "mine.toml").write_text(
+        '[report]\nrows = "name"\nreadme = ["samples", "pq_rmse"]\n'
+    )
+    report = tmp_path / "reports" / "mine"
+    report.mkdir(parents=True)
+    for name in ("table.md", "samples.png", "pq_fps.png"):
+        (report / name).touch()
+    (tmp_path / "README.md").write_text("<!-- results:mine -->\n<!-- /results -->\n")
+    text = readme.filled(tmp_path / "README.md", "mine", report)
+    assert re.findall(r"!\[(.*)\]\((.*)\)", text) == [
+        ("Sample predictions", "reports/mine/samples.png")
+    ]

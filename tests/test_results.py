@@ -77,6 +77,18 @@ def test_row_is_stale_when_its_code_changed(cell, directory, tmp_path, monkeypat
     assert "no method called 'mine'" in results.inspect(cell, runs).why
 
 
+def test_a_composition_is_stale_with_either_of_its_files(cell, directory, tmp_path):
+    (tmp_path / "methods" / "other.py").write_text(METHOD)
+    both = Cell(Recipe(), "tiny", "mine+other")
+    place = results.run_dir(both, tmp_path / "runs")
+    place.mkdir()
+    write_row(place, both)
+    assert results.status(both, tmp_path / "runs") == "done"
+    (tmp_path / "methods" / "other.py").write_text(METHOD + "# changed\n")
+    state = results.inspect(both, tmp_path / "runs")
+    assert (state.word, state.why) == ("stale", "methods/mine.py or methods/other.py changed")
+
+
 def test_harness_is_every_module_that_makes_numbers(tmp_path):
     package = provenance.PACKAGE
     for name in provenance.HARNESS:
@@ -133,6 +145,10 @@ def test_rows_of_a_grid_have_todays_status(cell, directory, tmp_path):
     assert (first["status"], first["metric"]) == ("done", {"panoptic.pq": 0.5})
     assert (second["status"], second["seed"], "metric" in second) == ("missing", 1, False)
     assert second["cell"]["backbone"] == "tiny"
+    assert "name" not in first
+    names = {cell.id: "First", other.id: "Second"}
+    found = results.rows([cell, other], tmp_path / "runs", names)
+    assert [row["name"] for row in found] == ["First", "Second"]
 
 
 # --- claims ---------------------------------------------------------------------------------------

@@ -63,13 +63,13 @@ def interior(scene, frame, seen):
     return key, (windows == key[..., None, None]).all((2, 3))
 
 
-def warp_error(height, width, number):
-    """Sums of |warped next - now| and |next - now| over static surfaces, and their pixels."""
-    scene = render.draw_scene((0, 1, number), height, width, 3, 1)
+def warp_error(scene, frame, step):
+    """Sums of |warped neighbour - now| and |neighbour - now| over static surfaces, their pixels."""
     camera = scene.camera
-    now, later = (render.image(scene, frame) / 255 for frame in (1, 2))
-    seen, seen_later = render.truth(scene, 1), render.truth(scene, 2)
-    T = context_from_target(scene.motion.poses[1], scene.motion.poses[2])
+    height, width = camera.height, camera.width
+    now, later = (render.image(scene, i) / 255 for i in (frame, frame + step))
+    seen, seen_later = (render.truth(scene, i) for i in (frame, frame + step))
+    T = context_from_target(scene.motion.poses[frame], scene.motion.poses[frame + step])
     v, u = np.mgrid[:height, :width].astype(float)
     z = seen.depth_HW.astype(float)
     points = np.stack([(u - camera.u0) / camera.fx * z, (v - camera.v0) / camera.fy * z, z], -1)
@@ -79,8 +79,8 @@ def warp_error(height, width, number):
     v_later = points[..., 1] / z_later * camera.fy + camera.v0
     inside = (u_later >= 0) & (u_later < width - 1) & (v_later >= 0) & (v_later < height - 1)
     u_later, v_later = np.where(inside, u_later, 0), np.where(inside, v_later, 0)
-    key, inner = interior(scene, 1, seen)
-    key_later, inner_later = interior(scene, 2, seen_later)
+    key, inner = interior(scene, frame, seen)
+    key_later, inner_later = interior(scene, frame + step, seen_later)
     static = inside & inner & (seen.depth_HW > 0) & ~seen.moving_HW
     u0, v0 = np.floor(u_later).astype(int), np.floor(v_later).astype(int)
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the same surface, not one that occludes it
@@ -92,9 +92,20 @@ def warp_error(height, width, number):
 
 @pytest.mark.parametrize(("height", "width", "scenes"), [(64, 128, 12), (256, 512, 2)])
 def test_true_depth_and_motion_warp_the_next_frame(height, width, scenes):
-    sums = np.array([warp_error(height, width, i) for i in range(scenes)]).sum(0)
+    streets = (render.draw_scene((0, 1, i), height, width, 3, 1) for i in range(scenes))
+    sums = np.array([warp_error(street, 1, 1) for street in streets]).sum(0)
     assert sums[2] > 0.3 * scenes * height * width
     assert sums[1] / sums[2] > 0.015  # there is something to see
+    assert sums[0] <= 0.1 * sums[1]
+
+
+@pytest.mark.parametrize("frame", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("step", [-1, 1])
+def test_frames_without_labels_warp_as_well_as_the_annotated_one(frame, step):
+    """The video stage trains on them: seven frames share one texture filter."""
+    streets = [render.draw_scene((0, 1, i), HEIGHT, WIDTH, 7, 3) for i in range(6)]
+    sums = np.array([warp_error(street, frame, step) for street in streets]).sum(0)
+    assert sums[1] / sums[2] > 0.015
     assert sums[0] <= 0.1 * sums[1]
 
 
@@ -220,6 +231,27 @@ def test_long_snippets_have_the_labels_where_cityscapes_has_them(tmp_path):
     names = sorted(p.name for p in out.glob("leftImg8bit_sequence/train/*/*.png"))
     assert [name.split("_")[2] for name in names] == [f"{i:06d}" for i in range(30)]
     assert [p.name.split("_")[2] for p in out.glob("gtFine/train/*/*labelIds.png")] == ["000019"]
+
+
+def test_a_recipe_chooses_the_length_of_the_snippets(tmp_path):
+    """Labels, disparity and camera belong to the middle frame alone, the images to all."""
+    data = Data(height=16, width=32, train_scenes=2, val_scenes=1)
+    folders = {
+        frames: synthetic.ensure(replace(data, frames=frames), tmp_path, progress=False)
+        for frames in (3, 4, 7)
+    }
+    assert len(set(folders.values())) == 3
+    for frames, out in folders.items():
+        for split, scenes in (("train", 2), ("val", 1), ("test", 8)):
+            video = sorted(out.glob(f"leftImg8bit_sequence/{split}/*/*.png"))
+            assert len(video) == scenes * frames
+            for kind in ("leftImg8bit", "gtFine", "disparity", "camera", "vehicle", "egomotion"):
+                found = {p.name.split("_")[2] for p in out.glob(f"{kind}/{split}/*/*")}
+                assert found == {f"{frames // 2:06d}"}
+    for frames in (0, 2):
+        with pytest.raises(ValueError, match=rf"recipe\.data\.frames = {frames}, but") as error:
+            synthetic.ensure(replace(data, frames=frames), tmp_path)
+        assert "\n" not in str(error.value)
 
 
 def test_a_killed_run_leaves_no_data_set(tmp_path):

@@ -23,12 +23,16 @@ from mtl_bench.train import build, schedule, train
 CPU = torch.device("cpu")
 
 
-def run(cell, root: Path, run_dir: Path, progress=None):
+def run(cell, root: Path, run_dir: Path, progress=None, **options):
     run_dir.mkdir(exist_ok=True)
     progress = progress or Progress(run_dir, lambda line: None)
-    return train(
-        cell, CITYSCAPES20, root, run_dir, Engine(CPU), progress, Tracker("off", cell, run_dir)
-    )
+    tracker = Tracker("off", cell, run_dir)
+    return train(cell, CITYSCAPES20, root, run_dir, Engine(CPU), progress, tracker, **options)
+
+
+def curve(run_dir: Path) -> list[dict[str, str]]:
+    with (run_dir / "curve.csv").open() as file:
+        return list(csv.DictReader(file))
 
 
 def states(run_dir: Path) -> dict[str, torch.Tensor]:
@@ -78,7 +82,13 @@ train(cell, CITYSCAPES20, root, run_dir, Engine(torch.device("cpu")), Dies(run_d
 """
 
 
-@pytest.mark.parametrize("method", ["fixed", "uncertainty", "fixed_uncertainty"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        *("fixed", "uncertainty", "fixed_uncertainty", "famo"),  # famo looks again after the step
+        *("modo", "auto_lambda", "fixed_uncertainty+pcgrad"),  # 3 batches a step, 2, and both kinds
+    ],
+)
 def test_killed_and_resumed_equals_straight_bit_for_bit(method, smoke_cell, smoke_root, tmp_path):
     cell = replace(smoke_cell, method=method)
     assert (cell.recipe.optim.steps, cell.recipe.optim.checkpoint_every) == (6, 3)
@@ -232,3 +242,86 @@ def test_bfloat16_trains(smoke_cell, smoke_root, tmp_path):
     tracker = Tracker("off", smoke_cell, run_dir)
     train(smoke_cell, CITYSCAPES20, smoke_root, run_dir, engine, progress, tracker)
     assert all(t.isfinite().all() for t in states(run_dir).values() if t.is_floating_point())
+
+
+# --- what a second training starts from, parts of a batch, diagnostics ----------------------------
+
+
+def test_a_second_training_goes_on_from_weights_and_method_alone(
+    smoke_cell, smoke_root, tmp_path, with_optim
+):
+    run(smoke_cell, smoke_root, tmp_path / "first")
+    still = with_optim(smoke_cell, steps=1, lr=0.0, method_lr=0.0)
+    run(still, smoke_root, tmp_path / "second", start=tmp_path / "first" / "last.pt")
+    first, second = states(tmp_path / "first"), states(tmp_path / "second")
+    kept = [key for key in first if key.startswith("/model") and "running" not in key]
+    kept = [key for key in kept if "num_batches" not in key]
+    assert len(kept) > 50
+    assert all(torch.equal(first[key], second[key]) for key in kept)
+    key = "/method/log_variance_T"
+    assert torch.equal(first[key], second[key])
+    assert (first[key] != 0).all()
+    assert second["/optimizer/state/0/step"] == 1  # the optimiser begins anew
+
+
+def test_an_own_checkpoint_wins_over_the_start(smoke_cell, smoke_root, tmp_path):
+    run(smoke_cell, smoke_root, tmp_path / "first")
+    other = replace(smoke_cell, seed=1)
+    run(other, smoke_root, tmp_path / "second")
+    before = states(tmp_path / "second")
+    run(other, smoke_root, tmp_path / "second", start=tmp_path / "first" / "last.pt")
+    assert all(
+        torch.equal(before[key], value) for key, value in states(tmp_path / "second").items()
+    )
+
+
+@pytest.mark.parametrize("method", ["fixed_uncertainty", "gls", "cagrad", "mgda_ub"])
+def test_a_batch_in_parts_trains(method, smoke_cell, smoke_root, tmp_path, with_optim):
+    cell = with_optim(replace(smoke_cell, method=method), micro_batch=2)
+    run(cell, smoke_root, tmp_path / "parts")
+    assert all(float(row["total"]) == float(row["total"]) for row in curve(tmp_path / "parts"))
+
+
+def test_parts_that_do_not_fill_a_batch_are_refused(smoke_cell, smoke_root, tmp_path, with_optim):
+    with pytest.raises(ValueError, match=r"recipe\.optim\.micro_batch"):
+        run(with_optim(smoke_cell, micro_batch=3), smoke_root, tmp_path / "run")
+
+
+def test_tasks_in_place_of_terms(smoke_cell, smoke_root, tmp_path):
+    run(replace(smoke_cell, method="fixed", granularity="tasks"), smoke_root, tmp_path / "tasks")
+    run(replace(smoke_cell, method="fixed"), smoke_root, tmp_path / "terms")
+    rows = curve(tmp_path / "tasks")
+    assert [name for name in rows[0] if name.startswith("weight.")] == [
+        *("weight.panoptic", "weight.depth")
+    ]
+    assert {row["weight_sum"] for row in rows} == {"2"}
+    first, second = float(rows[0]["total"]), float(curve(tmp_path / "terms")[0]["total"])
+    assert first == pytest.approx(second, rel=1e-5)
+
+
+def test_cosines_are_logged_where_asked_and_change_nothing(
+    smoke_cell, smoke_root, tmp_path, with_optim
+):
+    cell = replace(smoke_cell, granularity="tasks")
+    run(cell, smoke_root, tmp_path / "without")
+    run(with_optim(cell, cosine_every=3), smoke_root, tmp_path / "with")
+    assert_same_state(tmp_path / "without", tmp_path / "with")
+    cosines = [row["cosine.panoptic.depth"] for row in curve(tmp_path / "with")]
+    assert [bool(text) for text in cosines] == [True, False, False, True, False, False]
+    assert all(-1 <= float(text) <= 1 for text in cosines if text)
+
+
+def test_without_labels_depth_is_masked_automatically(smoke_cell, smoke_root, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(smoke_root, root, ignore=shutil.ignore_patterns("gtFine"))
+    depth = replace(smoke_cell, tasks=("depth",), method="fixed")
+    assert not depth.recipe.loss.automask
+    asked = replace(depth.recipe, loss=replace(depth.recipe.loss, automask=True))
+    run(depth, root, tmp_path / "forced")
+    run(replace(depth, recipe=asked), root, tmp_path / "asked")
+    assert_same_state(tmp_path / "forced", tmp_path / "asked")
+
+
+def test_two_loss_methods_do_not_compose(smoke_cell):
+    with pytest.raises(ValueError, match="is not a loss-value method"):
+        build(replace(smoke_cell, method="fixed+uncertainty"), CITYSCAPES20, Engine(CPU))

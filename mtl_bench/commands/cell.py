@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from mtl_bench.commands import options as o
-from mtl_bench.config import TASKS, Cell, load_recipe, override
+from mtl_bench.config import GRANULARITIES, TASKS, Cell, load_recipe, override
 
 
 def register(app: typer.Typer) -> None:
@@ -41,10 +41,28 @@ def train(
     ] = None,
     tasks: Annotated[str, typer.Option(help="Separated by commas.")] = ",".join(TASKS),
     seed: Annotated[int, typer.Option(help="Of initial weights, data order and method.")] = 0,
+    video: Annotated[
+        bool,
+        typer.Option(
+            "--video",
+            help="Then train on, with pseudo labels for the frames of the sequences, too.",
+        ),
+    ] = False,
+    single_task: Annotated[
+        bool,
+        typer.Option("--single-task", help="A network for each task, evaluated side by side."),
+    ] = False,
+    granularity: Annotated[
+        str,
+        typer.Option(
+            metavar="|".join(GRANULARITIES),
+            help="What the method weighs: loss terms, or tasks as sums of them at fixed weights.",
+        ),
+    ] = GRANULARITIES[0],
     settings: o.SetOption = None,
     pretrained: o.PretrainedOption = None,
     rerun: Annotated[
-        bool, typer.Option("--rerun", help="Forget an earlier result or checkpoint.")
+        bool, typer.Option("--rerun", help="Forget its earlier result or checkpoint.")
     ] = False,
     data: o.DataOption = None,
     runs: o.RunsOption = Path("runs"),
@@ -53,7 +71,10 @@ def train(
     plugins: o.PluginsOption = None,
     quiet: o.QuietOption = False,
 ) -> None:
-    """Train one cell, evaluate it, time it, and write its row."""
+    """Train one cell, evaluate it, time it, and write its row.
+
+    What it needs is run before: of --video the cell without it, of --single-task one for each task.
+    """
     if cell_file is not None:
         from mtl_bench import results
 
@@ -63,18 +84,29 @@ def train(
             raise ValueError("say which cell: --backbone NAME and --method NAME, or a cell.json")
         names = tuple(word.strip() for word in tasks.split(",") if word.strip())
         weights = o.weights(pretrained)
-        cell = Cell(load_recipe(recipe), backbone, method, names, seed, pretrained=weights)
+        cell = Cell(
+            load_recipe(recipe),
+            backbone,
+            method,
+            names,
+            seed,
+            video=video,
+            single_task=single_task,
+            granularity=granularity,
+            pretrained=weights,
+        )
     run(override(cell, settings or []), data, runs, device.value, wandb.value, rerun, quiet)
 
 
 def run(
     cell: Cell, data: Path | None, runs: Path, device: str, wandb: str, rerun: bool, quiet: bool
 ) -> None:
-    """Claim a cell and run what is left of it; a failure is written down before it is raised."""
-    from mtl_bench import claim, launch, plugins, results
+    """Run what is left of a cell, after the cells that it needs."""
+    from mtl_bench import plugins, results
+    from mtl_bench.display import label
+    from mtl_bench.grids import with_parents
 
     plugins.check_cells([cell])
-    directory = results.run_dir(cell, runs)
     if not rerun and _done_already(cell, runs):
         return
     root = o.data_root(cell, data, quiet)
@@ -83,6 +115,24 @@ def run(
         if not quiet:
             typer.echo(line)
 
+    for parent in with_parents(cell.parents):
+        state = results.inspect(parent, runs)
+        if state.word == "stale":
+            again = f"mtl-bench train {results.run_dir(parent, runs)}/cell.json --rerun"
+            raise ValueError(f"a cell that this one needs is stale, {state.why}: {again}")
+        if state.word != "done":
+            echo(f"{label(cell)} needs {label(parent)} first")
+            _run_claimed(parent, runs, root, device, wandb, False, echo)
+    _run_claimed(cell, runs, root, device, wandb, rerun, echo)
+
+
+def _run_claimed(
+    cell: Cell, runs: Path, root: Path, device: str, wandb: str, rerun: bool, echo: Any
+) -> None:
+    """Claim a cell and run it; a failure is written down before it is raised."""
+    from mtl_bench import claim, launch, results
+
+    directory = results.run_dir(cell, runs)
     try:
         with claim.claim(directory):
             if rerun:

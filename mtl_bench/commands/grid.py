@@ -2,9 +2,7 @@
 
 import hashlib
 import json
-import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mtl_bench.commands import options as o
+from mtl_bench.commands.choice import Choice
 from mtl_bench.config import Cell, to_dict
 
 if TYPE_CHECKING:
@@ -67,7 +66,8 @@ def ablate(
 ) -> None:
     """Run what a grid still lacks, then write its report.
 
-    Cells that are done are reused, interrupted and failed ones tried again.
+    Cells that are done are reused, interrupted and failed ones tried again; cells that others need
+    run before them, be they in the grid or not.
     """
     from mtl_bench import launch
     from mtl_bench.plugins import check_cells
@@ -85,7 +85,7 @@ def ablate(
         return
     options = ["--device", device.value, "--wandb", wandb.value]
     if todo:
-        _run(todo, runs, data, options, jobs, rerun, quiet)
+        _run(chosen, todo, runs, data, options, jobs, rerun, quiet)
     _baseline(chosen, data, runs, quiet, refresh=bool(todo))
     page = _write(chosen, runs, reports, choice.command)
     words = [row["status"] for row in _rows(chosen, runs)]
@@ -106,21 +106,29 @@ def status(
     runs: o.RunsOption = Path("runs"),
     plugins: o.PluginsOption = None,
 ) -> None:
-    """List a grid's cells: done, stale, failed, interrupted, running or missing."""
+    """List a grid's cells: done, stale, failed, interrupted, running or missing.
+
+    Those that are in no row of the grid but needed by one are marked as such.
+    """
     from mtl_bench import launch, results
     from mtl_bench.display import label
+    from mtl_bench.grids import with_parents
 
     chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
+    own, every = {cell.id for cell in chosen.cells}, with_parents(chosen.cells)
     lines = []
-    for cell in chosen.cells:
+    for cell in every:
         state = results.inspect(cell, runs)
         about = "  ".join(filter(None, (state.why, state.headline)))
-        lines.append([state.word, label(cell), str(results.run_dir(cell, runs)), about])
+        name = chosen.names.get(cell.id, "") if cell.id in own else "(needed by another)"
+        named = [name] if chosen.names or len(every) > len(own) else []
+        place = str(results.run_dir(cell, runs))
+        lines.append([state.word, *named, label(cell), place, about])
     for line in o.columns(lines):
         typer.echo(line)
     for skip in chosen.skips:
         typer.echo(f"  skipped: {label(skip.cell)}: {skip.why}")
-    typer.echo(launch.summary(chosen.cells, runs))
+    typer.echo(launch.summary(every, runs))
 
 
 def report(
@@ -161,67 +169,32 @@ def report(
 # --- steps ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What was said about which cells to take."""
-
-    grid: str
-    recipe: str | None
-    seeds: int | None
-    smoke: bool
-    settings: list[str] | None
-    pretrained: str | None
-
-    def load(self) -> "Grid":
-        from mtl_bench.grids import load_grid
-
-        return load_grid(
-            self.grid,
-            recipe=self.recipe,
-            seeds=self.seeds,
-            smoke=self.smoke,
-            settings=self.settings or [],
-            pretrained=o.weights(self.pretrained),
-        )
-
-    @property
-    def command(self) -> str:
-        """How to run the same cells again; files without their folders."""
-        words = ["mtl-bench", "ablate", "--grid", Path(self.grid).name]
-        for option, value in (
-            ("--recipe", self.recipe and Path(self.recipe).name),
-            ("--seeds", self.seeds),
-            ("--pretrained", self.pretrained and Path(self.pretrained).name),
-        ):
-            words += [option, str(value)] if value is not None else []
-        words += ["--smoke"] * self.smoke
-        for setting in self.settings or []:
-            words += ["--set", setting]
-        return shlex.join(words)
-
-
 def _announce(grid: "Grid", todo: Sequence[Cell], runs: Path) -> None:
     from mtl_bench import launch
     from mtl_bench.display import label
+    from mtl_bench.grids import with_parents
 
-    size = grid.recipe.data
-    product = " x ".join(
-        f"{len(values)} {axis}{'s' * (len(values) > 1)}" for axis, values in grid.axes.items()
-    )
+    size, cells = grid.recipe.data, with_parents(grid.cells)
+    counts = {axis: len(values) for axis, values in grid.axes.items()}
+    counts |= {"row": len(set(grid.names.values()))} if grid.names else {}
+    product = " x ".join(f"{n} {axis}{'s' * (n > 1)}" for axis, n in counts.items())
+    needed = len(cells) - len(grid.cells)
+    more = f" and {needed} that they need" if needed else ""
     typer.echo(f"{grid.name}: {grid.question}")
     typer.echo(
-        f"{len(grid.cells)} cells = {product}, less {len(grid.skips)} skipped; recipe "
+        f"{len(grid.cells)} cells{more} = {product}, less {len(grid.skips)} skipped; recipe "
         f"{grid.recipe.name} ({size.dataset}, {size.height}x{size.width}, "
         f"{grid.recipe.optim.steps} steps)"
     )
-    hours = launch.hours_to_run(len(todo), grid.cells, runs)
+    hours = launch.hours_to_run(todo, cells, runs)
     about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
-    typer.echo(f"  {launch.summary(grid.cells, runs)}   to run {len(todo)}{about}")
+    typer.echo(f"  {launch.summary(cells, runs)}   to run {len(todo)}{about}")
     for skip in grid.skips:
         typer.echo(f"  skipped: {label(skip.cell)}: {skip.why}")
 
 
 def _run(
+    grid: "Grid",
     todo: Sequence[Cell],
     runs: Path,
     data: Path | None,
@@ -240,13 +213,27 @@ def _run(
         return launch.cell_command(cell, runs, roots[cell.recipe.data], passed_on)
 
     with display.choose(len(todo), quiet) as shown:
-        launch.Launcher(runs, command, shown, jobs, rerun).run(todo)
+        launch.Launcher(runs, command, shown, jobs, rerun, grid.names).run(todo)
 
 
 def _rows(grid: "Grid", runs: Path) -> list[dict[str, Any]]:
+    """One row a cell, with its deltas to the stored row of its baseline."""
     from mtl_bench import results
 
-    return results.rows(grid.cells, runs)
+    rows = results.rows(grid.cells, runs, grid.names)
+    if not grid.baseline:
+        return rows
+    from mtl_bench.grids import baseline_cell
+    from mtl_bench.report.delta import with_delta
+
+    cells = {cell.id: cell for cell in grid.cells}
+
+    def baseline_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
+        cell = baseline_cell(cells[row["cell_id"]], grid.baseline)
+        stored = results.rows([cell], runs)[0]
+        return stored if "metric" in stored else None
+
+    return with_delta(rows, baseline_of)
 
 
 def _write(grid: "Grid", runs: Path, reports: Path, command: str) -> Path:

@@ -52,6 +52,27 @@ class Batch:
             moved[field.name] = value
         return Batch(**moved)
 
+    def split(self, size: int) -> list[Batch]:
+        """Consecutive parts of that many samples, for what does not fit into memory at once.
+
+        Raises:
+            ValueError: a size that does not divide the batch.
+        """
+        count = len(self.names)
+        if size < 1 or count % size:
+            raise ValueError(
+                f"recipe.optim.micro_batch = {size} does not divide a batch of {count}; "
+                f"set it to a divisor of recipe.optim.batch"
+            )
+        parts = []
+        for start in range(0, count, size):
+            part: dict[str, Any] = {}
+            for field in dataclasses.fields(self):
+                value = getattr(self, field.name)
+                part[field.name] = None if value is None else value[start : start + size]
+            parts.append(Batch(**part))
+        return parts
+
 
 def collate(samples: list[Batch]) -> Batch:
     """Stack single samples (tensors without the B axis) into a batch; they must have one size."""

@@ -10,7 +10,7 @@ from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SE
 
 PUBLISHED_FRAMES = {"train": 2975, "val": 500, "test": 1525}  # of the real Cityscapes
 # What a run needs: which split, which files of every annotated frame
-NEEDS = {
+NEEDS: dict[str, tuple[str, tuple[Kind, ...]]] = {
     "panoptic training": ("train", (IMAGE, CAMERA, LABELS)),
     "depth training": ("train", (IMAGE, CAMERA, SEQUENCE)),
     "panoptic evaluation": ("val", (IMAGE, CAMERA, LABELS)),
@@ -39,12 +39,16 @@ class Report:
         frames: annotated frames of each split.
         present: files of each (split, folder) that belong to annotated frames.
         problems: all of them, in the order of splits and frames.
+        unlabelled: training frames of the videos that pseudo labels can be made for.
+        reprojection_mask: where the depth task's masks come from, see `Cityscapes`.
     """
 
     root: Path
     frames: dict[str, int] = field(default_factory=dict)
     present: Counter[tuple[str, str]] = field(default_factory=Counter)
     problems: list[Problem] = field(default_factory=list)
+    unlabelled: int = 0
+    reprojection_mask: str = "labels"
 
     def obstacle(self, purpose: str) -> str | None:
         """Why a purpose of NEEDS is out of reach; None where nothing is in its way."""
@@ -54,6 +58,8 @@ class Report:
         for kind in kinds:
             if not self.present[split, kind.folder]:
                 return f"no {kind.folder}/{split}; unpack {kind.package}"
+        if purpose == "depth training" and self.reprojection_mask != "labels":
+            kinds = (*kinds, files.EGO_MASK)
         count = sum(p.split == split and p.kind in kinds for p in self.problems)
         return f"{count} problem{'s' * (count > 1)}" if count else None
 
@@ -76,7 +82,21 @@ class Report:
         for purpose, (split, _) in NEEDS.items():
             if split in self.frames:
                 lines.append(f"{purpose}: {self.obstacle(purpose) or 'ready'}")
-        return lines
+        return lines + self._without_labels()
+
+    def _without_labels(self) -> list[str]:
+        """What can be done with training frames that have no labels."""
+        if not self.frames.get("train"):
+            return []
+        mask = self.reprojection_mask
+        lines = []
+        if not self.present["train", LABELS.folder]:
+            lines.append("without labels: only depth can be trained")
+        if mask != "labels":
+            hint = f"; {files.EGO_MASK.suffix} would mask the ego vehicle"
+            hint = "" if files.EGO_MASK.suffix in mask else hint
+            lines.append(f"reprojection mask: {mask}, with the auto-mask{hint}")
+        return [*lines, f"pseudo labels: {self.unlabelled} training frames could get them"]
 
 
 def check(root: Path, splits: tuple[str, ...] = ("train", "val"), deep: bool = False) -> Report:
@@ -98,6 +118,9 @@ def check(root: Path, splits: tuple[str, ...] = ("train", "val"), deep: bool = F
         names = files.annotated_names(root, split)
         report.frames[split] = len(names)
         _check_split(report, split, names, deep)
+        if split == "train":
+            report.unlabelled = len(files.unlabelled_names(root, split))
+            _check_ego_mask(report, names)
     report.frames |= {split: 0 for split in splits if split not in some}
     return report
 
@@ -125,6 +148,23 @@ def _check_split(report: Report, split: str, names: list[str], deep: bool) -> No
                     size = own_size if kind is IMAGE else size
                 except ValueError as error:
                     report.problems.append(Problem(split, kind, "bad", str(error)))
+
+
+def _check_ego_mask(report: Report, names: list[str]) -> None:
+    """It is in use where a training frame lacks labels; one image stands for all."""
+    path = report.root / files.EGO_MASK.suffix
+    labelled = report.present["train", LABELS.folder]
+    report.reprojection_mask = files.reprojection_mask(len(names), labelled, path.exists())
+    if labelled == len(names) or not path.exists():
+        return
+    image_path = files.file_of(report.root / IMAGE.folder / "train", IMAGE, names[0])
+    try:
+        size = files.read_ego_mask(path).shape
+        image = png.read_header(image_path)
+        files.check_same_size(path, size, image_path, (image.height, image.width))
+    except ValueError as error:
+        if not any(str(problem) == str(error) for problem in report.problems):
+            report.problems.append(Problem("train", files.EGO_MASK, "bad", str(error)))
 
 
 def _check_file(path: Path, kind: Kind, deep: bool) -> tuple[int, int] | None:

@@ -24,8 +24,7 @@ from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SE
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
 from mtl_bench.data.targets import OUTSIDE, panoptic_targets
 
-# Label ids without static surface behind their pixels: ego vehicle, sky. And no pixels at all.
-NOT_REPROJECTED = torch.tensor([1, 23, OUTSIDE])
+NOT_REPROJECTED = torch.tensor([files.EGO_ID, files.SKY_ID, OUTSIDE])
 _PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
 
 
@@ -43,6 +42,9 @@ class _Frame:
 
 class Cityscapes:
     """One split.
+
+    Frames without labels, which the depth task trains on, too, may share `<root>/ego_mask.png`: of
+    the frames' own size, 8 bits, not 0 on the ego vehicle and whatever else has nothing to tell.
 
     Args:
         root: the folder that holds leftImg8bit, gtFine, camera, ...
@@ -85,11 +87,25 @@ class Cityscapes:
         self._label_files = self._find_labels()
         if sequence_labels:
             self.names = self._with_sequence_frames()
+        mask_path = root / files.EGO_MASK.suffix
+        masked = video and augment is not None and not self._annotated <= self._label_files.keys()
+        self._ego_mask = files.read_ego_mask(mask_path) if masked and mask_path.exists() else None
         self._camera_names = self._find_cameras()
         self._require_files(training=augment is not None)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def reprojection_mask(self) -> str:
+        """What the training frames' masks come from: labels, ego_mask.png, none, or two of them."""
+        labelled = len(self._label_files.keys() & set(self.names))
+        return files.reprojection_mask(len(self.names), labelled, self._ego_mask is not None)
+
+    @property
+    def needs_automask(self) -> bool:
+        """Whether masks may leave the sky in: only labels know where it is."""
+        return self.reprojection_mask != "labels"
 
     def uncached(self) -> "Cityscapes":
         """The same split, remembering nothing: for worker processes, which would each hold it."""
@@ -176,8 +192,11 @@ class Cityscapes:
             label_path = self._label_files[name]
             ids = files.read_instance_ids(label_path)
             files.check_same_size(label_path, ids.shape, path, own_size)
-            if training:
-                ids = self._to_input(ids, path, cv2.INTER_NEAREST_EXACT)
+        elif training and self.video and self._ego_mask is not None:
+            ids = self._ego_mask
+            files.check_same_size(self.root / files.EGO_MASK.suffix, ids.shape, path, own_size)
+        if training and ids is not None:
+            ids = self._to_input(ids, path, cv2.INTER_NEAREST_EXACT)
         if self.video and not training:
             depth_path = self._file(DISPARITY, name)
             depth_m = files.read_depth_m(depth_path, camera)
@@ -228,11 +247,7 @@ class Cityscapes:
     def _with_sequence_frames(self) -> list[str]:
         """Annotated frames, and labelled frames of the sequences that have both neighbours."""
         present = files.names_in(self._folder(SEQUENCE), SEQUENCE)
-        further = {
-            name
-            for name in self._label_files.keys() & present
-            if {files.neighbour(name, -1), files.neighbour(name, 1)} <= present
-        }
+        further = files.with_neighbours(self._label_files.keys() & present, present)
         return sorted(further | self._annotated)
 
     def _find_cameras(self) -> dict[str, str]:

@@ -40,6 +40,9 @@ SEQUENCE = Kind("leftImg8bit_sequence", "_leftImg8bit.png", "neighbour frame", 8
 LABELS = Kind("gtFine", "_gtFine_instanceIds.png", "label file", 16)
 DISPARITY = Kind("disparity", "_disparity.png", "disparity map", 16)
 CAMERA = Kind("camera", "_camera.json", "camera file")
+EGO_MASK = Kind("", "ego_mask.png", "ego mask", 8)  # one for the whole data set, optional
+
+EGO_ID, SKY_ID = 1, 23  # label ids without static surface behind their pixels
 
 _NAME = re.compile(r"(?P<city>.+)_(?P<sequence>\d{6})_(?P<frame>\d{6})")
 
@@ -102,6 +105,38 @@ def annotated_names(root: Path, split: str) -> list[str]:
     return names
 
 
+def with_neighbours(names: set[str], present: set[str]) -> set[str]:
+    """Those of the names whose previous and next frames are present, too."""
+    return {name for name in names if {neighbour(name, -1), neighbour(name, 1)} <= present}
+
+
+def unlabelled_names(root: Path, split: str) -> list[str]:
+    """Frames that pseudo labels can be made for, sorted.
+
+    They have no label file, but a camera (their own or their annotated frame's) and both neighbours
+    in `leftImg8bit_sequence/<split>`.
+    """
+    present = names_in(root / SEQUENCE.folder / split, SEQUENCE)
+    labelled = names_in(root / LABELS.folder / split, LABELS)
+    sequences = {split_name(name)[:2] for name in annotated_names(root, split)}
+    own = {name for name in present - labelled if split_name(name)[:2] in sequences}
+    return sorted(with_neighbours(own, present))
+
+
+def reprojection_mask(frames: int, labelled: int, ego_mask: bool) -> str:
+    """In words: what keeps ego vehicle and sky out of the photometric loss, `none` or ...
+
+    Args:
+        frames: training frames.
+        labelled: those of them that have a label file.
+        ego_mask: whether the data set has an ego mask.
+    """
+    if labelled == frames:
+        return "labels"
+    other = EGO_MASK.suffix if ego_mask else "none"
+    return f"labels, or {other} where a frame lacks them" if labelled else other
+
+
 # --- contents -------------------------------------------------------------------------------------
 
 
@@ -162,6 +197,11 @@ def known_instance_ids() -> NDArray[np.bool_]:
     return np.isin(np.where(ids < DIVISOR, ids, ids // DIVISOR), list(KNOWN_LABEL_IDS))
 
 
+def read_ego_mask(path: Path) -> NDArray[np.uint16]:
+    """[H,W] instance ids that know nothing but the ego vehicle: its id where the file is not 0."""
+    return np.where(png.read(path, 8), np.uint16(EGO_ID), np.uint16(0))
+
+
 def read_depth_m(path: Path, camera: Camera) -> NDArray[np.float32]:
     """[H,W] depth in metres, 0 = no value: baseline * fx / disparity, where the file stores
     256 * disparity + 1 and 0 for none."""
@@ -177,5 +217,5 @@ def check_same_size(path: Path, size: tuple[int, ...], image_path: Path, expecte
     if tuple(size[:2]) != tuple(expected[:2]):
         raise ValueError(
             f"{path}: {size[0]}x{size[1]} pixels, but {image_path.name} has "
-            f"{expected[0]}x{expected[1]}; both must come from one release"
+            f"{expected[0]}x{expected[1]}; all files of a frame must be of one size"
         )

@@ -11,15 +11,15 @@ from torch import Tensor
 from mtl_bench import config
 from mtl_bench.data.batch import Batch
 from mtl_bench.losses.instance import center_loss, offset_loss
-from mtl_bench.losses.photometric import View, photometric_loss
+from mtl_bench.losses.photometric import photometric_loss
 from mtl_bench.losses.semantic import semantic_loss
 from mtl_bench.losses.smoothness import smoothness_loss
-from mtl_bench.losses.terms import TERMS, Term, terms_of
+from mtl_bench.losses.terms import TERMS, Term, gather, terms_of
 
 if TYPE_CHECKING:
     from mtl_bench.model import Outputs
 
-__all__ = ["TERMS", "Term", "loss_terms", "terms_of"]
+__all__ = ["TERMS", "Term", "gather", "loss_terms", "terms_of"]
 
 
 def loss_terms(
@@ -31,20 +31,22 @@ def loss_terms(
 ) -> dict[str, Tensor]:
     """The terms of these tasks, in the order of TERMS; zero, in the graph, where no pixel counts.
 
+    A task whose labels (or, for depth, neighbours in time) the batch lacks has no terms.
+
     Args:
         transforms_BN44: from the pose network, target camera to context cameras; depth task only.
 
     Raises:
         ValueError: a task without terms, or a scale that the outputs do not have.
     """
-    names = [term.name for term in terms_of(tasks)]
+    tasks = {term.task for term in terms_of(tasks)}
     values: dict[str, Tensor] = {}
     with torch.autocast(batch.image_B3HW.device.type, enabled=False):
-        if "semantic" in names:
+        if "panoptic" in tasks and batch.semantic_BHW is not None:
             values |= _panoptic(batch, outputs, loss)
-        if "photometric" in names:
+        if "depth" in tasks and batch.clean_context_BN3HW is not None:
             values |= _depth(batch, outputs, transforms_BN44, loss)
-    return {name: values[name] for name in names}
+    return values
 
 
 def _panoptic(batch: Batch, outputs: Outputs, loss: config.Loss) -> dict[str, Tensor]:
@@ -71,27 +73,21 @@ def _depth(
             f"{list(range(available))}: name one or more of those"
         )
     inverse_SB1HW = [_full(outputs.inverse_depth[scale]) for scale in loss.scales]
-    mask_BHW = batch.reprojection_mask_BHW
+    target_B3HW, mask_BHW = _full(batch.clean_B3HW), batch.reprojection_mask_BHW
     assert mask_BHW is not None
-    view = View(
-        _full(batch.clean_B3HW),
+    photometric = photometric_loss(
+        target_B3HW,
         _full(batch.clean_context_BN3HW),
         inverse_SB1HW,
         _full(batch.K_B33),
         mask_BHW,
+        _full(transforms_BN44),
+        ssim_weight=loss.ssim_weight,
+        automask=loss.automask,
     )
-    errors = [
-        photometric_loss(
-            *view.at_level(level),
-            _full(transforms_BN44),
-            ssim_weight=loss.ssim_weight,
-            automask=loss.automask,
-        )
-        for level in loss.levels
-    ]
     return {
-        "photometric": torch.stack(errors).mean(),
-        "smoothness": smoothness_loss(inverse_SB1HW, loss.scales, view.target_B3HW, mask_BHW),
+        "photometric": photometric,
+        "smoothness": smoothness_loss(inverse_SB1HW, loss.scales, target_B3HW, mask_BHW),
     }
 
 

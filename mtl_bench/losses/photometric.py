@@ -5,7 +5,6 @@ colour jitter.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -13,37 +12,6 @@ from torch import Tensor
 
 from mtl_bench import geometry
 from mtl_bench.losses.ssim import PhotometricError
-
-
-class View(NamedTuple):
-    """What a frame and its neighbours show, and from where."""
-
-    target_B3HW: Tensor
-    context_BN3HW: Tensor
-    inverse_SB1HW: Sequence[Tensor]  # one inverse depth a scale, all at full resolution
-    K_B33: Tensor
-    mask_BHW: Tensor  # bool, False on sky, ego vehicle and padding
-
-    def at_level(self, level: int) -> "View":
-        """The same view in images of 1/2^level the size, each pixel the mean of those it replaces.
-
-        A gradient reaches no further than the pixels next to a projection. In a small image these
-        are far apart, so that depth and pose find their way from a start that is many pixels off.
-        """
-        if level == 0:
-            return self
-        factor = 2**level
-
-        def shrink(x: Tensor) -> Tensor:
-            return F.avg_pool2d(x.flatten(0, -4), factor).unflatten(0, x.shape[:-3])
-
-        return View(
-            shrink(self.target_B3HW),
-            shrink(self.context_BN3HW),
-            [shrink(inverse_B1HW) for inverse_B1HW in self.inverse_SB1HW],
-            geometry.scale_intrinsics(self.K_B33, 1 / factor, 1 / factor),
-            shrink(self.mask_BHW.float().unsqueeze(1)).squeeze(1) > 0.5,
-        )
 
 
 def photometric_loss(

@@ -26,6 +26,7 @@ class Outputs:
     center_B1HW: Tensor | None = None  # in [0, 1]
     offset_B2HW: Tensor | None = None  # (y, x) to the instance's center, pixels
     inverse_depth: list[Tensor] = field(default_factory=list)  # each B1HW, finest first
+    representation: list[Tensor] = field(default_factory=list)  # in training: what decoders read
 
 
 class Network(nn.Module):
@@ -68,6 +69,11 @@ class Network(nn.Module):
         pyramid = [features[stride] for stride in self.strides]
         context = self.context(pyramid[2])
         outputs = Outputs()
+        if self.training:
+            # Views: a gradient with respect to the last level then leaves out its way through the
+            # context module, which has a gradient of its own.
+            *pyramid, context = (x.view_as(x) for x in (*pyramid, context))
+            outputs.representation = [*pyramid, context]
         if "semantic" in self.decoders:
             semantic = self.decoders["semantic"](pyramid, context)[0]
             instance = self.decoders["instance"](pyramid, context)[0]

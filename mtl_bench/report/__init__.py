@@ -9,12 +9,14 @@ if TYPE_CHECKING:
     from mtl_bench.report.tables import Row, Table
 
 FIGURES = {  # file stem: heading on the page, in its order
-    "pq_fps": "Panoptic quality against speed",
-    "rmse_fps": "Depth error against speed",
+    "pq_fps": "Panoptic quality against frames per second",
+    "rmse_fps": "Depth error against frames per second",
+    "pq_rmse": "Panoptic quality against depth error",
     "samples": "Sample predictions",
     "classes": "Panoptic quality per class",
     "loss_curves": "Training curves",
     "weight_curves": "Learned weights",
+    "diagnostics": "Update norm and gradient cosines",
 }
 
 
@@ -45,7 +47,7 @@ def build(
     """Write `index.html`, `table.{csv,md,tex}` and the figures; the same rows give the same bytes.
 
     Args:
-        grid: its name, question, recipe, and under `report` the row axis (`rows = "backbone"`).
+        grid: its name, question, recipe, and under `report` what `layout.Layout` says.
         rows: one per cell in the grid's order, as `row.json` holds them, with a status; a row
             without numbers has at least what names its cell, and its error.
         out_dir: created where absent; what an earlier build left is replaced.
@@ -55,26 +57,30 @@ def build(
 
     Returns:
         The page's path.
+
+    Raises:
+        ValueError: `grid.report` has a key or a value that it cannot have.
     """
     from mtl_bench.report import formats, page
+    from mtl_bench.report.layout import Layout
     from mtl_bench.report.tables import tabulate
 
-    metrics = (
-        None if baseline is None else baseline if "metric" in baseline else {"metric": baseline}
-    )
+    layout = Layout.of(grid.report)
+
+    has_section = baseline is None or "metric" in baseline
+    metrics = baseline if has_section else {"metric": baseline}
     rows = [*rows, *_skipped(grid)]
-    table = tabulate(rows, grid.report.get("rows", "backbone"), metrics)
+    table = tabulate(rows, layout, metrics)
     out_dir.mkdir(parents=True, exist_ok=True)
     for stem in FIGURES:
         for suffix in ("png", "svg"):
             (out_dir / f"{stem}.{suffix}").unlink(missing_ok=True)
+    figures = [] if layout.only else _draw(table, out_dir, runs_root)
     files = {
         "table.csv": formats.csv(table),
         "table.md": formats.markdown(table),
         "table.tex": formats.latex(table),
-        "index.html": page.render(
-            grid, table, rows, _draw(table, out_dir, runs_root), command, out_dir
-        ),
+        "index.html": page.render(grid, table, rows, figures, command, out_dir),
     }
     for name, content in files.items():
         (out_dir / name).write_text(content, encoding="utf-8", newline="\n")
@@ -92,8 +98,10 @@ def _skipped(grid: Grid) -> "list[Row]":
     """The cells that the grid leaves out, as rows that say why."""
     from mtl_bench.config import to_dict
 
+    names = getattr(grid, "names", {})
     return [
         {
+            **({"name": names[skip.cell.id]} if skip.cell.id in names else {}),
             "slug": skip.cell.slug,
             "seed": skip.cell.seed,
             "cell": to_dict(skip.cell),
@@ -105,15 +113,20 @@ def _skipped(grid: Grid) -> "list[Row]":
 
 
 def _draw(table: "Table", out_dir: Path, runs_root: Path | None) -> "list[Figure]":
-    from mtl_bench.report import pictures, plots
+    from mtl_bench.report import curves, pictures, plots
     from mtl_bench.report.page import Figure
 
-    captions = {f"{name}_fps": plots.against_speed(table, name, out_dir) for name in ("pq", "rmse")}
-    captions["classes"] = plots.classes(table, out_dir)
+    captions = {
+        "pq_fps": plots.against(table, "pq", "fps", out_dir),
+        "rmse_fps": plots.against(table, "rmse", "fps", out_dir),
+        "pq_rmse": plots.against(table, "pq", "rmse", out_dir),
+        "classes": plots.classes(table, out_dir),
+    }
     if runs_root is not None:
         runs = _curves(table, runs_root)
-        captions["loss_curves"] = plots.curves(table, runs, "loss", out_dir)
-        captions["weight_curves"] = plots.curves(table, runs, "weight", out_dir)
+        captions["loss_curves"] = curves.terms(table, runs, "loss", out_dir)
+        captions["weight_curves"] = curves.terms(table, runs, "weight", out_dir)
+        captions["diagnostics"] = curves.diagnostics(table, runs, out_dir)
         captions["samples"] = pictures.draw(table, runs_root, out_dir)
     drawn = [(stem, heading, captions.get(stem)) for stem, heading in FIGURES.items()]
     return [Figure(stem, heading, caption) for stem, heading, caption in drawn if caption]

@@ -1,24 +1,16 @@
 """The table as CSV, Markdown, LaTeX and on a terminal: the same numbers in four spellings."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from mtl_bench.report.columns import BY_NAME, COLUMNS, RELATIVE, Column, Row, measured
+from mtl_bench.report.groups import SMOKE, Entry, Group
+from mtl_bench.report.layout import Layout
 from mtl_bench.report.notes import footnotes
-from mtl_bench.report.tables import (
-    BY_NAME,
-    COLUMNS,
-    SMOKE,
-    Column,
-    Entry,
-    Group,
-    Row,
-    Table,
-    measured,
-    tabulate,
-)
+from mtl_bench.report.tables import Table, tabulate
 
 if TYPE_CHECKING:
     import rich.table
@@ -26,7 +18,8 @@ if TYPE_CHECKING:
 PLUS_MINUS = "\u00b1"
 ARROWS = {+1: "\u2191", -1: "\u2193"}
 NOTHING = "-"
-AXES = {"recipe.name": "recipe"}
+AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
+PUBLISHED = {"pq": ("PQ", +1), "rmse": ("RMSE (m)", -1), "fps": ("FPS", +1)}
 TEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},
     "\\": r"\textbackslash{}",
@@ -38,11 +31,15 @@ TEX = {
 }
 ARROWS_TEX = {+1: r"$\uparrow$", -1: r"$\downarrow$"}
 IN_SUMMARY = ("pq", "abs_rel", "rmse", "fps")
-TITLES_TEX = {"delta1": r"$\delta_1$"}
+TITLES_TEX = {
+    "delta1": r"$\delta_1$",
+    "delta_flat": r"$\Delta$ flat",
+    "delta_task": r"$\Delta$ task",
+}
 
 
 def number(value: float, column: Column) -> str:
-    return NOTHING if math.isnan(value) else f"{value:.{column.digits}f}"
+    return NOTHING if math.isnan(value) else f"{value:z.{column.digits}f}"
 
 
 def halves(value: Entry, column: Column, seeds: int) -> tuple[str, str]:
@@ -91,6 +88,8 @@ def csv(table: Table) -> str:
         for column in COLUMNS:
             value = group.entries[column.name]
             line |= {column.name: value.mean, f"{column.name}_std": value.std}
+        if table.reference is not None:
+            line |= {column.name: group.entries[column.name].mean for column in RELATIVE}
         lines.append(line)
     for source in table.published:
         for row in source["rows"]:
@@ -121,12 +120,12 @@ def markdown(table: Table) -> str:
         lines = [[cell.label, cell.status, cell.reason] for cell in table.unfinished]
         parts.append(f"**Without numbers**\n\n{_grid(['cell', 'status', 'why'], lines, 3)}")
     for source in table.published:
-        head = [axis_title(table.axes[0]), *(f"{name} {a}" for name, a in published_head())]
-        lines = [[row["name"], *published_values(row)] for row in source["rows"]]
+        head = [axis_title(table.axes[0]), *(f"{name} {a}" for name, a in published_head(source))]
+        lines = [[row["name"], *published_values(row, source)] for row in source["rows"]]
         parts.append(
             f"**{source['mark']}**, not comparable with the rows above\n\n{_grid(head, lines, 1)}"
         )
-        parts.append(f"{source['source']}: {source['dataset']}, {source['gpu']}, {source['note']}.")
+        parts.append(f"{source['source']}: {', '.join(about(source))}.")
     parts.append("\n".join(f"- {pretty(note)}" for note in footnotes(table)))
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -148,8 +147,8 @@ def latex(table: Table) -> str:
         caption = f"{caption}{heading}. {notes}" if heading == "Quality" else f"{caption}{heading}."
         parts.append(_float(heads, lines, len(table.axes), caption, fit=True))
     for source in table.published:
-        head = [f"{name} {a}" for name, a in published_head(ARROWS_TEX)]
-        lines = [[tex(row["name"]), *published_values(row)] for row in source["rows"]]
+        head = [f"{name} {a}" for name, a in published_head(source, ARROWS_TEX)]
+        lines = [[tex(row["name"]), *published_values(row, source)] for row in source["rows"]]
         caption = f"{source['mark']}. {source['source']}. {sentence(source['note'])}."
         parts.append(_float([[axis_title(table.axes[0]), *head]], lines, 1, caption, fit=False))
     return "\n\n".join(parts) + "\n"
@@ -166,7 +165,7 @@ def summary_table(rows: Sequence[Row], axis: str = "backbone") -> "rich.table.Ta
     import rich.box
     import rich.table
 
-    table = tabulate(rows, axis)
+    table = tabulate(rows, Layout(rows=axis))
     columns = [column for column in table.columns() if column.name in IN_SUMMARY]
     shown = rich.table.Table(
         box=rich.box.SIMPLE_HEAD, caption="depth is median-scaled; spread over n seeds"
@@ -215,12 +214,24 @@ def pretty(note: str) -> str:
     return note.replace("+-", PLUS_MINUS)
 
 
-def published_head(arrows: dict[int, str] = ARROWS) -> list[tuple[str, str]]:
-    return [("PQ", arrows[+1]), ("RMSE (m)", arrows[-1]), ("FPS", arrows[+1])]
+def published_head(
+    source: Mapping[str, Any], arrows: dict[int, str] = ARROWS
+) -> list[tuple[str, str]]:
+    """Titles and arrows of what a published list has."""
+    return [(PUBLISHED[name][0], arrows[PUBLISHED[name][1]]) for name in _metrics(source)]
 
 
-def published_values(row: Row) -> list[str]:
-    return [f"{row[name]:.1f}" for name in ("pq", "rmse", "fps")]
+def published_values(row: Row, source: Mapping[str, Any]) -> list[str]:
+    return [f"{row[name]:.1f}" if name in row else NOTHING for name in _metrics(source)]
+
+
+def about(source: Mapping[str, Any]) -> list[str]:
+    """How published numbers were made."""
+    return [source[key] for key in ("dataset", "gpu", "note") if key in source]
+
+
+def _metrics(source: Mapping[str, Any]) -> list[str]:
+    return [name for name in PUBLISHED if any(name in row for row in source["rows"])]
 
 
 def _grid(head: Sequence[str], lines: Sequence[Sequence[str]], left: int) -> str:

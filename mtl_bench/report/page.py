@@ -10,8 +10,11 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
-from mtl_bench.report import formats
-from mtl_bench.report.tables import SHOWN, SMOKE, Group, Row, Table, flatten, text
+from mtl_bench.report import FIGURES, formats
+from mtl_bench.report.columns import Row, flatten
+from mtl_bench.report.groups import PSEUDO, SMOKE, Group, text
+from mtl_bench.report.style import MANY
+from mtl_bench.report.tables import SHOWN, Table
 
 TEMPLATE = "page.html.j2"
 SECTIONS = (  # title, dotted prefix of a row
@@ -21,6 +24,7 @@ SECTIONS = (  # title, dotted prefix of a row
     ("Training", "cell.recipe.optim."),
     ("Augmentation", "cell.recipe.augment."),
     ("Losses", "cell.recipe.loss."),
+    ("Pseudo labels", f"cell.{PSEUDO}"),
     ("Post-processing", "cell.recipe.evaluate."),
     ("Environment", "env."),
 )
@@ -36,6 +40,7 @@ TIMING = (
     "clock",
 )
 COUNTED = ("failed", "fallback")  # dgc.*
+WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples")
 
 
 @dataclass(frozen=True)
@@ -69,8 +74,8 @@ def render(
             grid=grid,
             recipe=getattr(grid.recipe, "name", grid.recipe),
             table=table,
-            columns=table.columns(),
             figures=drawn,
+            wide=FIGURES if len(table.groups) > MANY else WIDE,
             smoke=SMOKE,
             states=_states(rows),
             sections=protocol(table),
@@ -88,8 +93,11 @@ def protocol(table: Table) -> list[tuple[str, list[tuple[str, str, bool]]]]:
     flats = [flatten(row) for group in table.groups for row in group.rows]
     sections = [("Cells", _settings(flats, {"seed": "seed", **_CELL}))]
     for title, prefix in SECTIONS:
-        keys = dict.fromkeys(k for flat in flats for k in flat if k.startswith(prefix))
-        sections.append((title, _settings(flats, {key: key.removeprefix(prefix) for key in keys})))
+        # the video stage's settings are in every cell, but say something of its own cells only
+        having = [f for f in flats if f.get("cell.video")] if PSEUDO in prefix else flats
+        keys = dict.fromkeys(k for flat in having for k in flat if k.startswith(prefix))
+        names = {key: key.removeprefix(prefix) for key in keys}
+        sections.append((title, _settings(having, names)))
     timing = {f"metric.latency.{name}": name for name in TIMING}
     sections.append(
         ("Latency, batch 1, transfer and post-processing included", _settings(flats, timing))
@@ -101,7 +109,9 @@ _CELL = {
     "cell.method": "method",
     "cell.backbone": "backbone",
     "cell.tasks": "tasks",
+    "cell.single_task": "one network a task",
     "cell.video": "video stage",
+    "cell.granularity": "what is weighed",
     "cell.pretrained": "pre-trained weights",
 }
 

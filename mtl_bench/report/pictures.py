@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
+from mtl_bench.report.groups import SMOKE
 from mtl_bench.report.style import GRAY, save, styled
-from mtl_bench.report.tables import SMOKE, Table
+from mtl_bench.report.tables import Table
 
-IMAGES = 3
-GROUPS = 6  # more would be too small to see
+IMAGES, IMAGES_OF_MANY = 3, 2
+GROUPS = 6  # more would be too small to see, so they are not all there, and of fewer images
 TILE = 192  # pixels wide
 NEAR_M, FAR_M = 2.0, 80.0  # ends of the depth colours, logarithmic between them
 NO_DEPTH = (90, 90, 90)
@@ -66,7 +67,8 @@ def draw(
     if not found:
         return None
     shown = found[:GROUPS]
-    lines = _lines([samples for _, samples in shown], labels)
+    images = IMAGES if len(found) == len(shown) else IMAGES_OF_MANY
+    lines = _lines([samples for _, samples in shown], images, labels)
     titles = ["input", "truth", *(label for label, _ in shown)]
     _draw_lines(lines, titles, table.smoke, out_dir)
     left_out = f" The first {GROUPS} of {len(found)}." if len(found) > GROUPS else ""
@@ -107,10 +109,10 @@ def depth_colors(depth_m_HW: NDArray[np.floating]) -> Image:
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _lines(runs: Sequence[Samples], labels: LabelSet) -> list[list[Image | None]]:
+def _lines(runs: Sequence[Samples], images: int, labels: LabelSet) -> list[list[Image | None]]:
     """Tiles, line by line; None where there is nothing to show."""
     lines: list[list[Image | None]] = []
-    for index, name in enumerate(runs[0].names[:IMAGES]):
+    for index, name in enumerate(runs[0].names[:images]):
         image = runs[0].image[index]
         found = [(run, run.names.index(name)) if name in run.names else None for run in runs]
         start: Image | None = _fit(image)
@@ -172,7 +174,8 @@ def _draw_lines(
         figure.figimage(canvas, origin="upper")
         for x, title in enumerate(titles):
             center = (x * (TILE + gap) + TILE / 2) / canvas_width
-            figure.text(center, 1 - (top - 8) / canvas_height, title, ha="center", fontsize=9)
+            size = min(9, 245 / len(title))  # a long one fits its tile
+            figure.text(center, 1 - (top - 8) / canvas_height, title, ha="center", fontsize=size)
         if smoke:
             figure.text(0.5, 1 - 14 / canvas_height, SMOKE, ha="center", color=GRAY, fontsize=9)
         save(figure, out_dir, "samples", pixels=True)

@@ -1,4 +1,4 @@
-"""The report's drawn figures: quality against speed, curves, learned weights, quality per class."""
+"""The report's figures of what was measured: one column against another, quality per class."""
 
 import math
 import re
@@ -11,94 +11,63 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
-from mtl_bench.report.style import BASELINE, GRAY, Look, looks, save, styled
-from mtl_bench.report.tables import BY_NAME, SMOKE, Column, Group, Table
+from mtl_bench.report.columns import BY_NAME, Column
+from mtl_bench.report.groups import SMOKE, Group
+from mtl_bench.report.style import BASELINE, GRAY, MANY, Look, looks, save, styled
+from mtl_bench.report.tables import Table
 
-POINTS = 60  # per curve: longer ones are averaged
-PANEL = (2.9, 2.1)  # inches
+RINGS = (10, 14, 20, 27, 35, 45, 57, 70)  # distances of a number from its point, in points
+ANGLES = [math.radians(a) for a in range(45, 405, 30)]
+ROOM = 9.5  # around a number, in points
 CLASS = re.compile(r"panoptic\.class\.(.+)\.pq")
-Curves = Mapping[str, Sequence[pd.DataFrame]]  # group label -> one frame per seed
 
 
-def against_speed(table: Table, name: str, out_dir: Path) -> str | None:
-    """`<name>_fps`: a quality column against FPS, one marker per group with its spread.
+def against(table: Table, y: str, x: str, out_dir: Path) -> str | None:
+    """`<y>_<x>`: two columns against each other, one marker per group with its spread.
 
     Returns:
-        What the figure shows in words, or None where no group has both numbers.
+        What the figure shows in words, or None where no group has both numbers, or where the
+        differences in speed are noise, since all groups have the same network.
     """
-    column, fps = BY_NAME[name], BY_NAME["fps"]
-    groups = [g for g in table.groups if g.entries[name].count and g.entries["fps"].count]
-    if not groups:
+    groups = [g for g in table.groups if g.entries[y].count and g.entries[x].count]
+    sizes = {group.entries["params_m"].mean for group in groups}
+    if not groups or (x == "fps" and len(groups) > 1 and len(sizes) == 1):
         return None
+    down, across = BY_NAME[y], BY_NAME[x]
+    many = len(groups) > MANY
     with styled():
-        figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+        figure = Figure(figsize=(9.2, 4.8) if many else (6.4, 3.6), layout="constrained")
         axes = figure.add_subplot()
-        handles = []
-        for group, look in _looks(table):
+        handles: list[Any] = []
+        spots = {}
+        for number, (group, look) in enumerate(looks_of(table), 1):
             if group in groups:
-                _point(axes, group, column, look)
-                label = f"{group.label} (n={len(group.rows)})"
+                spots[number] = (group.entries[x].mean, group.entries[y].mean)
+                _point(axes, group, across, down, look)
+                label = f"{number} " * many + f"{group.label} (n={len(group.rows)})"
                 handles.append(Line2D([], [], linestyle="", label=label, **_marker(group, look)))
-        if table.baseline and table.baseline.entries[name].count:
-            level = table.baseline.entries[name].mean
+        if x == "fps" and table.baseline and table.baseline.entries[y].count:
+            level = table.baseline.entries[y].mean
             handles.append(axes.axhline(level, label="trivial predictor", **BASELINE))
-        axes.set_xlabel(f"{fps.title} (higher is better)\n{_where_timed(groups)}")
-        better = "higher" if column.better > 0 else "lower"
-        unit = f", {column.note}" if column.note else ""
-        axes.set_ylabel(f"{column.title}{unit}\n({better} is better)")
+        where = f"\n{_where_timed(groups)}" if x == "fps" else ""
+        axes.set_xlabel(f"{_with_unit(across)} ({_better(across)} is better){where}")
+        axes.set_ylabel(f"{_with_unit(down)}\n({_better(down)} is better)")
         axes.margins(0.12)
-        _smoke(axes, table)
-        figure.legend(handles=handles, loc="outside right upper")
-        save(figure, out_dir, f"{name}_fps")
+        watermark(axes, table)
+        style: dict[str, Any] = {"ncols": 2, "fontsize": 7.5, "columnspacing": 1} if many else {}
+        figure.legend(handles=handles, loc="outside right upper", **style)
+        if many:
+            _number(axes, spots)
+        save(figure, out_dir, f"{y}_{x}")
+    if many:
+        return f"{down.title} against {across.title}; the numbers are those of the legend."
     points = "; ".join(
-        f"{g.label} {g.entries[name].mean:.{column.digits}f} at {g.entries['fps'].mean:.1f} FPS"
-        for g in groups
+        f"{g.label} {_short(g, down)} at {_short(g, across)} {across.title}" for g in groups
     )
-    return f"{column.title} against FPS. {points}."
-
-
-def curves(table: Table, runs: Curves, prefix: str, out_dir: Path) -> str | None:
-    """`<prefix>_curves`: one panel per loss term over the training steps, one line per group.
-
-    Args:
-        runs: training curves of the groups that have them.
-        prefix: `loss` (unweighted terms) or `weight` (what the method multiplies them with).
-
-    Returns:
-        What the figure shows in words, or None where there is nothing to show: no curves, or
-        weights that no method changes.
-    """
-    columns = list(dict.fromkeys(c for frames in runs.values() for f in frames for c in f.columns))
-    terms = [column for column in columns if column.startswith(f"{prefix}.")]
-    frames = [frame for several in runs.values() for frame in several]
-    if prefix == "weight" and all(f[t].nunique() < 2 for t in terms for f in frames if t in f):
-        return None
-    if not terms:
-        return None
-    across = min(3, len(terms) + 1)
-    down = math.ceil((len(terms) + 1) / across)  # the last panel holds the legend
-    with styled():
-        figure = Figure(figsize=(PANEL[0] * across, PANEL[1] * down), layout="constrained")
-        panels = figure.subplots(down, across, squeeze=False).flatten()
-        handles: dict[str, object] = {}
-        for axes, term in zip(panels, terms, strict=False):
-            for group, look in _looks(table):
-                several = [f for f in runs.get(group.label, ()) if term in f]
-                if several:
-                    line = _curve(axes, several, term, look, group.status == "stale")
-                    handles.setdefault(group.label, line)
-            axes.set_title(term.removeprefix(f"{prefix}."))
-            axes.set_xlabel("step")
-            _log_scale(axes)
-            _smoke(axes, table)
-        for axes in panels[len(terms) :]:
-            axes.set_axis_off()
-        panels[len(terms)].legend(handles.values(), handles.keys(), loc="center")
-        save(figure, out_dir, f"{prefix}_curves")
-    what = "Unweighted training loss" if prefix == "loss" else "Weight"
-    return f"{what} of each term over the training steps, mean over seeds with their range."
+    return f"{down.title} against {across.title}. {points}."
 
 
 def classes(table: Table, out_dir: Path, labels: LabelSet = CITYSCAPES20) -> str | None:
@@ -110,38 +79,75 @@ def classes(table: Table, out_dir: Path, labels: LabelSet = CITYSCAPES20) -> str
     if not names:
         return None
     heat = np.array([[quality.get(n, math.nan) for n in names] for quality in values.values()])
+    texts = [["-" if math.isnan(v) else f"{v:.0f}" for v in line] for line in heat]
+    heat_table(
+        table, (list(values), names), heat, texts, ("Blues", 0, 100, "PQ, %"), out_dir, "classes"
+    )
+    return "Panoptic quality per class, mean over seeds; only classes that occur in the split."
+
+
+def heat_table(
+    table: Table,
+    titles: tuple[Sequence[str], Sequence[str]],
+    heat: NDArray[np.floating],
+    texts: Sequence[Sequence[str]],
+    scale: tuple[str, float, float, str],
+    out_dir: Path,
+    name: str,
+) -> None:
+    """Numbers on their colours.
+
+    Args:
+        titles: of the rows and of the columns.
+        heat: [rows, columns]; NaN is white.
+        scale: colour map, its lowest and highest value, and what they are.
+    """
+    rows, columns = titles
+    colors, low, high, what = scale
     with styled():
-        height = 1.35 + 0.3 * len(values)
-        figure = Figure(figsize=(9.2, height), layout="constrained")
+        figure = Figure(figsize=(9.2, 1.35 + 0.3 * len(rows)), layout="constrained")
         axes = figure.add_subplot()
         axes.grid(False)
-        image = axes.imshow(heat, cmap="Blues", vmin=0, vmax=100, aspect="auto")
-        axes.set_xticks(range(len(names)), names, rotation=40, ha="right", rotation_mode="anchor")
-        axes.set_yticks(range(len(values)), list(values))
+        image = axes.imshow(heat, cmap=colors, vmin=low, vmax=high, aspect="auto")
+        axes.set_xticks(
+            range(len(columns)), columns, rotation=40, ha="right", rotation_mode="anchor"
+        )
+        axes.set_yticks(range(len(rows)), rows)
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
         for (y, x), value in np.ndenumerate(heat):
-            shown = "-" if math.isnan(value) else f"{value:.0f}"
-            color = "white" if value > 60 else "black"
-            axes.text(x, y, shown, ha="center", va="center", color=color, fontsize=8)
-        figure.colorbar(image, ax=axes, label="PQ, %", pad=0.01, fraction=0.03)
+            dark = not math.isnan(value) and sum(image.to_rgba(value)[:3]) < 1.6
+            color = "white" if dark else "black"
+            axes.text(x, y, texts[y][x], ha="center", va="center", color=color, fontsize=8)
+        figure.colorbar(image, ax=axes, label=what, pad=0.01, fraction=0.03)
         if table.smoke:
             axes.set_title(SMOKE, color="#a40000")
-        save(figure, out_dir, "classes")
-    return "Panoptic quality per class, mean over seeds; only classes that occur in the split."
+        save(figure, out_dir, name)
 
 
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _looks(table: Table) -> list[tuple[Group, Look]]:
+def looks_of(table: Table) -> list[tuple[Group, Look]]:
     """A group's look is its identity's, whatever its status."""
     found = looks(dict.fromkeys(group.identity for group in table.groups))
     return [(group, found[group.identity]) for group in table.groups]
 
 
-def _point(axes: Axes, group: Group, column: Column, look: Look) -> None:
-    x, y = group.entries["fps"], group.entries[column.name]
+def _with_unit(column: Column) -> str:
+    return f"{column.title}, {column.note}" if column.note else column.title
+
+
+def _better(column: Column) -> str:
+    return "higher" if column.better > 0 else "lower"
+
+
+def _short(group: Group, column: Column) -> str:
+    return f"{group.entries[column.name].mean:.{column.digits}f}"
+
+
+def _point(axes: Axes, group: Group, across: Column, down: Column, look: Look) -> None:
+    x, y = group.entries[across.name], group.entries[down.name]
     axes.errorbar(
         x.mean,
         y.mean,
@@ -152,6 +158,32 @@ def _point(axes: Axes, group: Group, column: Column, look: Look) -> None:
         capsize=2.5,
         **_marker(group, look),
     )
+
+
+def _number(axes: Axes, spots: Mapping[int, tuple[float, float]]) -> None:
+    """A number beside each point, at the nearest place that is free of points and numbers."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()  # settles the limits and the layout
+    to_points = 72 / figure.dpi
+    taken = list(axes.transData.transform(np.array(list(spots.values()))) * to_points)
+    for number, own in zip(spots, taken.copy(), strict=True):
+        offsets = [r * np.array([math.cos(a), math.sin(a)]) for r in RINGS for a in ANGLES]
+        rooms = [min(np.hypot(*(own + o - t)) for t in taken) for o in offsets]
+        free = (i for i, room in enumerate(rooms) if room >= ROOM)
+        offset = offsets[next(free, int(np.argmax(rooms)))]
+        taken.append(own + offset)
+        far = np.hypot(*offset) > RINGS[0]
+        axes.annotate(
+            str(number),
+            spots[number],
+            tuple(offset),
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=7,
+            arrowprops={"arrowstyle": "-", "color": GRAY, "linewidth": 0.5} if far else None,
+        ).set_in_layout(False)
 
 
 def _marker(group: Group, look: Look) -> dict[str, Any]:
@@ -177,32 +209,6 @@ def _where_timed(groups: Sequence[Group]) -> str:
     return ", ".join(["batch 1", *sizes]) + "\n" + ", ".join([*devices, *counts])
 
 
-def _curve(
-    axes: Axes, frames: Sequence[pd.DataFrame], column: str, look: Look, faint: bool
-) -> object:
-    """Mean over seeds with their range; faint for stale numbers."""
-    last = max(int(frame["step"].max()) for frame in frames)
-    width = max(1, math.ceil(last / POINTS))
-    binned = [f.groupby((f["step"] - 1) // width)[["step", column]].mean() for f in frames]
-    joined = pd.concat(binned).groupby(level=0)
-    step, middle = joined["step"].mean(), joined[column]
-    style: dict[str, Any] = {"color": look.color, "linestyle": look.dash}
-    style["alpha"] = 0.5 if faint else 1.0
-    (line,) = axes.plot(step, middle.mean(), linewidth=0.8 if faint else 1.4, **style)
-    if len(frames) > 1:
-        axes.fill_between(
-            step, middle.min(), middle.max(), color=look.color, alpha=0.18, linewidth=0
-        )
-    return line
-
-
-def _log_scale(axes: Axes) -> None:
-    """Where everything is positive and spans more than a factor of five."""
-    values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.get_lines()])
-    if values.size and values.min() > 0 and values.max() > 5 * values.min():
-        axes.set_yscale("log")
-
-
 def _class_quality(group: Group) -> dict[str, float]:
     """Percent per class, mean over the group's seeds."""
     per_seed = []
@@ -212,7 +218,7 @@ def _class_quality(group: Group) -> dict[str, float]:
     return {str(k): float(v) for k, v in pd.DataFrame(per_seed, dtype=float).mean().items()}
 
 
-def _smoke(axes: Axes, table: Table) -> None:
+def watermark(axes: Axes, table: Table) -> None:
     if table.smoke:
         axes.text(
             0.5,

@@ -1,22 +1,32 @@
-"""Puts a report's table and pictures into a README, between two marker lines.
+"""Puts reports' tables and pictures into a README, each between two marker lines.
 
 <!-- results:backbones -->
 (replaced)
 <!-- /results -->
+
+`python -m mtl_bench.report.readme README.md reports` does it for every pair of markers.
 """
 
 import os
 import re
+import sys
+import tomllib
 from pathlib import Path
 
-PICTURES = {
-    "pq_fps": "Panoptic quality against frames per second",
-    "rmse_fps": "Depth error against frames per second",
-}
+from mtl_bench.grids import GRIDS
+from mtl_bench.report import FIGURES
+from mtl_bench.report.layout import Layout
+
+START = re.compile(r"<!-- results:(\S+) -->\n")
 
 
-def update(readme: Path, name: str, report_dir: Path) -> bool:
-    """Replace what stands between `name`'s markers; whether anything changed.
+def names(readme: Path) -> list[str]:
+    """The reports that a README asks for, in its order."""
+    return START.findall(readme.read_text(encoding="utf-8"))
+
+
+def filled(readme: Path, name: str, report_dir: Path) -> str:
+    """The README's text with what belongs between `name`'s markers; nothing is written.
 
     Raises:
         ValueError: no such markers, or no report to take the table from.
@@ -31,13 +41,42 @@ def update(readme: Path, name: str, report_dir: Path) -> bool:
         raise ValueError(f"{readme} has no line '{start}' with a line '<!-- /results -->' after it")
     where = Path(os.path.relpath(report_dir, readme.parent)).as_posix()
     pictures = [
-        f"![{alternative}]({where}/{stem}.png)"
-        for stem, alternative in PICTURES.items()
+        f"![{FIGURES[stem]}]({where}/{stem}.png)"
+        for stem in _pictures(name)
         if (report_dir / f"{stem}.png").is_file()
     ]
     page = f"The whole report: [{where}/index.html]({where}/index.html)"
-    parts = [table.read_text(encoding="utf-8").rstrip("\n"), *pictures, page]
-    content = "\n\n".join(parts)
-    after = pattern.sub(lambda match: f"{match[1]}\n{content}\n\n{match[2]}", before)
+    content = "\n\n".join([table.read_text(encoding="utf-8").rstrip("\n"), *pictures, page])
+    return pattern.sub(lambda match: f"{match[1]}\n{content}\n\n{match[2]}", before)
+
+
+def update(readme: Path, name: str, report_dir: Path) -> bool:
+    """Replace what stands between `name`'s markers; whether anything changed.
+
+    Raises:
+        ValueError: as `filled`.
+    """
+    before, after = readme.read_text(encoding="utf-8"), filled(readme, name, report_dir)
     readme.write_text(after, encoding="utf-8", newline="\n")
     return after != before
+
+
+def _pictures(name: str) -> tuple[str, ...]:
+    """What the report's grid shows in a README; the usual ones for a grid that is not shipped."""
+    path = GRIDS / f"{name.removesuffix('-smoke')}.toml"
+    values = tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return Layout.of(values.get("report", {})).readme
+
+
+def _main(readme: Path, reports: Path) -> None:
+    for name in names(readme):
+        changed = update(readme, name, reports / name)
+        print(f"{name}: {'updated' if changed else 'as it was'}")
+
+
+if __name__ == "__main__":
+    try:
+        _main(Path(sys.argv[1]), Path(sys.argv[2]))
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -26,15 +26,23 @@ def ensure(data: Data, root: Path | None = None, progress: bool = True) -> Path:
     """The rendered data set that a recipe asks for; rendered now if it is not there yet.
 
     Args:
-        data: size, numbers of scenes and seed.
+        data: size, numbers of scenes, length of a snippet and seed.
         root: folder that holds rendered data sets; None = the user's cache folder.
         progress: show progress on stderr.
 
     Returns:
         The data set's folder, laid out like Cityscapes'.
+
+    Raises:
+        ValueError: snippets too short to train on, or sizes or counts that cannot be rendered.
     """
+    if data.frames < 3:
+        raise ValueError(
+            f"recipe.data.frames = {data.frames}, but training compares a frame with the one "
+            f"before it and the one after it; set 3 or more"
+        )
     settings = _settings(
-        data.height, data.width, data.train_scenes, data.val_scenes, 8, data.seed, 3, 1, None
+        data.height, data.width, data.train_scenes, data.val_scenes, 8, data.seed, data.frames
     )
     root = platformdirs.user_cache_path("mtl-bench") if root is None else Path(root)
     out = root / f"synthetic-{data.height}x{data.width}-{settings.key}"
@@ -75,8 +83,6 @@ def write(
     Raises:
         ValueError: `out` exists, or sizes or counts that cannot be rendered.
     """
-    if annotated is None:
-        annotated = 19 if frames == 30 else frames // 2
     settings = _settings(
         height,
         width,
@@ -104,9 +110,11 @@ def _settings(
     test: int,
     seed: int,
     frames: int,
-    annotated: int,
-    min_area: int | None,
+    annotated: int | None = None,
+    min_area: int | None = None,
 ) -> Settings:
+    if annotated is None:
+        annotated = 19 if frames == 30 else frames // 2
     if min_area is None:
         min_area = max(1, round(12 * height * width / (64 * 128)))
     return Settings(height, width, train, val, test, seed, frames, annotated, min_area)

@@ -1,0 +1,50 @@
+"""Fast adaptive multitask optimization: all losses fall at the same relative rate.
+
+Source: Liu, Feng, Stone, Liu, FAMO: Fast Adaptive Multitask Optimization, NeurIPS 2023,
+arXiv:2306.03792, with lower bounds of 0. Costs a second forward pass: the batch is evaluated again
+after the step, and the shares move towards what fell least. With losses below 1 the scalar is
+negative: a schedule must watch a metric instead. Losses below 1e-8 count as 1e-8, and then weigh
+nothing.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mtl_bench.losses.terms import Term
+from mtl_bench.method import LossMethod
+
+from ._adam import Adam
+
+
+class Famo(LossMethod):
+    """c sum_i z_i log L_i with z = softmax(xi), 1/c = sum_i z_i / L_i: the weights sum to 1
+
+    Args:
+        lr: of the Adam that moves xi; 0.025 in the paper.
+        decay: its weight decay gamma; 0.001 in the paper, which takes 0.01 on Cityscapes.
+    """
+
+    reevaluates = True
+    xi_T: Tensor
+
+    def __init__(
+        self, terms: Sequence[Term], seed: int = 0, lr: float = 0.025, decay: float = 0.001
+    ):
+        super().__init__(terms, seed)
+        self.register_buffer("xi_T", torch.zeros(len(terms)))
+        self.adam = Adam(self.xi_T, lr, weight_decay=decay)
+
+    def total(self, loss_K: Tensor) -> Tensor:
+        loss_K = loss_K.clamp_min(1e-8)
+        share_K = torch.softmax(self.xi_T[self.present], 0)
+        constant = 1 / (share_K / loss_K.detach()).sum()
+        return constant * (share_K * loss_K.log()).sum()
+
+    def after_step(self, before_K: Tensor, after_K: Tensor) -> None:
+        xi_K = self.xi_T[self.present]
+        share_K = torch.softmax(xi_K, 0)
+        fall_K = before_K.clamp_min(1e-8).log() - after_K.clamp_min(1e-8).log()
+        grad_K = share_K * (fall_K - (share_K * fall_K).sum())  # softmax' Jacobian times the fall
+        self.xi_T[self.present] = self.adam.step(xi_K, grad_K, self.present)

@@ -1,0 +1,291 @@
+"""The video stage's labels: what a trained model predicts on frames that no human labelled.
+
+Naive-Student's idea (Chen et al., ECCV 2020) as MGNet uses it: predictions averaged over scales and
+mirror images, grouped into instances, written in Cityscapes' format:
+
+    <out>/pseudo_labels.json                                    what made them
+    <out>/gtFine/<split>/<city>/<name>_gtFine_labelIds.png      8 bits
+    <out>/gtFine/<split>/<city>/<name>_gtFine_instanceIds.png   16 bits, written last: frame done
+
+Departures from MGNet's public code: small stuff segments stay (a small pole is still a pole), and
+human labels are neither copied nor touched. Shapes: B frames, C classes, H x W pixels.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mtl_bench import config, postprocess
+from mtl_bench.data import cityscapes_files as files
+from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, Kind
+from mtl_bench.data.labels import CITYSCAPES20, IGNORE, LabelSet
+from mtl_bench.data.targets import DIVISOR
+from mtl_bench.evaluate import Progress, evaluating
+from mtl_bench.model import Model, Outputs
+from mtl_bench.plain import to_dict
+
+RECORD = "pseudo_labels.json"
+LABEL_IDS = Kind("gtFine", "_gtFine_labelIds.png", "label map", 8)
+PIXELS = 2**18  # of the input images that go through the network at once; one frame at least
+GROUPING = ("center_threshold", "nms_kernel", "top_k")  # what of config.Evaluate labels depend on
+
+Size = tuple[int, int]  # height, width
+
+
+class Maps(NamedTuple):
+    """The panoptic outputs, averaged: probabilities in place of logits."""
+
+    probability_BCHW: Tensor
+    center_B1HW: Tensor
+    offset_B2HW: Tensor
+
+
+def ensure(
+    model: Model,
+    cell: config.Cell,
+    root: Path,
+    out: Path,
+    device: torch.device,
+    progress: Progress | None = None,
+    split: str = "train",
+    labels: LabelSet = CITYSCAPES20,
+) -> Path:
+    """Label every frame of the sequences that has both neighbours and no human label.
+
+    Stopped and called again it goes on, and on the CPU ends with the same bytes.
+
+    Args:
+        cell: `recipe.pseudo` says how to predict, `recipe.evaluate` how to group pixels.
+        out: a new or empty folder, or one that such a call began.
+        progress: told how many frames have labels, at the start and after each.
+
+    Returns:
+        The folder that `open_dataset` takes as `sequence_labels`.
+
+    Raises:
+        ValueError: a cell without the panoptic task, options without meaning, no frame to label,
+            an `out` with human labels or labels of another making, a prediction that is not finite.
+    """
+    _check(cell)
+    source, folder = root / SEQUENCE.folder / split, out / LABELS.folder / split
+    names = files.unlabelled_names(root, split)
+    if not names:
+        raise ValueError(
+            f"{source}: no frame without a human label that has both neighbours; unpack "
+            f"{SEQUENCE.package}, or render the built-in scenes with recipe.data.frames=4 or more"
+        )
+    if folder.resolve().is_relative_to((root / LABELS.folder).resolve()):
+        raise ValueError(f"{out}: the data set's own labels belong there; choose another --out")
+    _claim_folder(out, _record(model, cell, source, labels))
+
+    done = files.names_in(folder, LABELS).intersection(names)
+    count = len(done)
+    if progress:
+        progress(count, len(names))
+    with evaluating(model), torch.inference_mode():
+        for name, maps in _predictions(model, cell, source, names, done, device):
+            _write_frame(folder, name, instance_ids(maps, cell, labels)[0])
+            count += 1
+            if progress:
+                progress(count, len(names))
+    return folder
+
+
+def _check(cell: config.Cell) -> None:
+    if "panoptic" not in cell.tasks:
+        raise ValueError(f"cell {cell.slug} has no panoptic task: it cannot make pseudo labels")
+    options = cell.recipe.pseudo
+    if not options.scales or min(options.scales) <= 0:
+        raise ValueError(f"pseudo.scales must be positive numbers, not {list(options.scales)}")
+    if not 0 <= options.min_confidence <= 1:
+        raise ValueError(f"pseudo.min_confidence must be 0 to 1, not {options.min_confidence}")
+
+
+# --- prediction -----------------------------------------------------------------------------------
+
+
+def pass_sizes(recipe: config.Recipe) -> list[Size]:
+    """Input sizes of the passes: the recipe's, scaled, to the nearest that the network divides."""
+    stride = recipe.network.strides[-1]
+
+    def scaled(length: int, scale: float) -> int:
+        return max(round(length * scale / stride), 1) * stride
+
+    height, width = recipe.data.height, recipe.data.width
+    return [(scaled(height, scale), scaled(width, scale)) for scale in recipe.pseudo.scales]
+
+
+def average(
+    net: Callable[[Tensor], Outputs], image_B3HW: Tensor, sizes: list[Size], flip: bool
+) -> Maps:
+    """Means over passes at these sizes and, with `flip`, of the mirrored image; at its own size."""
+    passes = [(size, mirrored) for size in sizes for mirrored in (False, True)[: 1 + flip]]
+    sums = _one_pass(net, image_B3HW, *passes[0])
+    for size, mirrored in passes[1:]:
+        parts = _one_pass(net, image_B3HW, size, mirrored)
+        sums = Maps(*(total + part for total, part in zip(sums, parts, strict=True)))
+    return Maps(*(total / len(passes) for total in sums))
+
+
+def _one_pass(
+    net: Callable[[Tensor], Outputs], image_B3HW: Tensor, size: Size, mirrored: bool
+) -> Maps:
+    """The image seen at another size, as augmentation resizes, or mirrored; turned back."""
+    height, width = image_B3HW.shape[2:]
+    if size != (height, width):
+        image_B3HW = F.interpolate(image_B3HW, size, mode="bilinear", antialias=True)
+    outputs = net(image_B3HW.flip(-1) if mirrored else image_B3HW)
+    assert outputs.semantic_BCHW is not None
+    assert outputs.center_B1HW is not None
+    assert outputs.offset_B2HW is not None
+    probability_BCHW = outputs.semantic_BCHW.float().softmax(1)
+    maps = Maps(probability_BCHW, outputs.center_B1HW, outputs.offset_B2HW)
+    if mirrored:
+        maps = Maps(*(x.flip(-1) for x in maps))
+        y_B1HW, x_B1HW = maps.offset_B2HW.split(1, 1)
+        maps = maps._replace(offset_B2HW=torch.cat([y_B1HW, -x_B1HW], 1))
+    return _resized(maps, (height, width))
+
+
+def _resized(maps: Maps, size: Size) -> Maps:
+    if maps.center_B1HW.shape[2:] == size:
+        return maps
+    outputs = postprocess.resize(Outputs(*maps), *size)
+    return Maps(outputs.semantic_BCHW, outputs.center_B1HW, outputs.offset_B2HW)  # type: ignore[arg-type]
+
+
+def instance_ids(maps: Maps, cell: config.Cell, labels: LabelSet) -> NDArray[np.uint16]:
+    """Cityscapes' ids [B,H,W].
+
+    Thing pixels of a frame without a center keep the bare label id (crowd); pixels less certain
+    than `pseudo.min_confidence` get 0 and no vote. Unlike `postprocess.to_instance_ids`, classes
+    that are trained but not evaluated are written: the ego vehicle masks the reprojection.
+    """
+    confidence_BHW, class_BHW = maps.probability_BCHW.max(1)
+    panoptic_BHW = postprocess.panoptic(
+        class_BHW.masked_fill(confidence_BHW < cell.recipe.pseudo.min_confidence, IGNORE),
+        maps.center_B1HW,
+        maps.offset_B2HW,
+        labels.things,
+        replace(cell.recipe.evaluate, stuff_area=0),
+    )
+    panoptic = panoptic_BHW.cpu().numpy()
+    void = panoptic == postprocess.VOID
+    label_id_of_class = labels.label_id_of_class().astype(int)
+    label_ids = label_id_of_class[np.where(void, IGNORE, panoptic // DIVISOR)]
+    number = np.where(void, 0, panoptic % DIVISOR)
+    return np.where(number > 0, label_ids * DIVISOR + number, label_ids).astype(np.uint16)
+
+
+def _predictions(
+    model: Model,
+    cell: config.Cell,
+    source: Path,
+    names: list[str],
+    done: set[str],
+    device: torch.device,
+) -> Iterator[tuple[str, Maps]]:
+    """Predictions for the frames that are not done, one by one at their own size.
+
+    Batches are cut from all the frames, not from those that are left: a frame's last bits may
+    depend on its batch.
+    """
+    data = cell.recipe.data
+    batch_size = max(1, PIXELS // (data.height * data.width))
+    for start in range(0, len(names), batch_size):
+        batch = names[start : start + batch_size]
+        if done.issuperset(batch):
+            continue
+        images = [files.read_image(files.file_of(source, SEQUENCE, name)) for name in batch]
+        image_B3HW = torch.stack([_to_input(image, data) for image in images]).to(device)
+        sizes, flip = pass_sizes(cell.recipe), cell.recipe.pseudo.flip
+        maps = average(model.net, image_B3HW.float() / 255, sizes, flip)
+        if not all(x.isfinite().all() for x in maps):
+            raise ValueError(f"the prediction is not finite in a frame of {batch}")
+        for slot, (name, image) in enumerate(zip(batch, images, strict=True)):
+            if name not in done:
+                yield name, _resized(Maps(*(x[slot : slot + 1] for x in maps)), image.shape[:2])
+
+
+def _to_input(image_HW3: NDArray[np.uint8], data: config.Data) -> Tensor:
+    """[3,H,W] at the recipe's size, as the reader shrinks frames."""
+    if image_HW3.shape[:2] != (data.height, data.width):
+        image_HW3 = cv2.resize(image_HW3, (data.width, data.height), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(image_HW3).permute(2, 0, 1)
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def _record(model: nn.Module, cell: config.Cell, source: Path, labels: LabelSet) -> dict[str, Any]:
+    """What the labels depend on; no paths, as folders move."""
+    recipe = cell.recipe
+    weights = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        weights.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
+        weights.update(tensor.cpu().contiguous().flatten().view(torch.uint8).numpy())
+    first = files.file_of(source, SEQUENCE, min(files.names_in(source, SEQUENCE)))
+    return {
+        "protocol": config.PROTOCOL,
+        "weights": weights.hexdigest(),
+        "labels": labels.name,
+        "split": source.name,
+        "first frame": hashlib.sha256(first.read_bytes()).hexdigest(),  # tells data sets apart
+        "input": [recipe.data.height, recipe.data.width],
+        "passes": [list(size) for size in pass_sizes(recipe)],
+        **to_dict(recipe.pseudo),
+        **{key: getattr(recipe.evaluate, key) for key in GROUPING},
+    }
+
+
+def _claim_folder(out: Path, record: dict[str, Any]) -> None:
+    """Write the record into a fresh folder, or compare with the one that is there.
+
+    Raises:
+        ValueError: labels of another or of unknown making are there.
+    """
+    path = out / RECORD
+    if path.is_file():
+        try:
+            there = json.loads(path.read_text())
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged ({error}); choose another --out") from error
+        other = [key for key in record if there.get(key) != record[key]]
+        if other:
+            raise ValueError(
+                f"{out} holds pseudo labels that were made with other {', '.join(other)}; choose "
+                f"another --out, or delete that folder"
+            )
+        return
+    unknown = next(out.rglob("*_gtFine_*"), None)
+    if unknown:
+        raise ValueError(f"{unknown} is not of this command's making; choose another --out")
+    _write(path, json.dumps(record, indent=1).encode() + b"\n")
+
+
+def _write_frame(folder: Path, name: str, ids_HW: NDArray[np.uint16]) -> None:
+    label_HW = np.where(ids_HW < DIVISOR, ids_HW, ids_HW // DIVISOR).astype(np.uint8)
+    for kind, array in ((LABEL_IDS, label_HW), (LABELS, ids_HW)):
+        _write(files.file_of(folder, kind, name), cv2.imencode(".png", array)[1].tobytes())
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)

@@ -1,0 +1,255 @@
+"""Cells that need others, whole, on the smoke recipe: single-task networks, the video stage."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mtl_bench import checkpoint, claim, pseudo_labels, results
+from mtl_bench.config import Cell, load_recipe
+from mtl_bench.grids import with_parents
+from mtl_bench.progress import Interrupted
+from mtl_bench.run import load_model, reevaluate, run_cell
+
+
+@pytest.fixture(scope="module")
+def cells():
+    """Row -> cell: together, its video stage, and apart."""
+    plain = Cell(load_recipe("smoke"), "tiny", "fixed_uncertainty")
+    apart, video = replace(plain, single_task=True), replace(plain, video=True)
+    panoptic, depth = apart.parents
+    return {
+        "together": plain,
+        "video": video,
+        "apart": apart,
+        "panoptic": panoptic,
+        "depth": depth,
+    }
+
+
+def execute(cell, runs, root):
+    with claim.claim(results.run_dir(cell, runs)):
+        directory, _ = results.begin(cell, runs)
+        return run_cell(cell, directory, root, "cpu", echo=lambda line: None)
+
+
+@pytest.fixture(scope="module")
+def finished(cells, smoke_root, tmp_path_factory):
+    """The run folders of all five cells."""
+    runs = tmp_path_factory.mktemp("runs")
+    for cell in with_parents([cells["apart"], cells["video"]]):
+        execute(cell, runs, smoke_root)
+    return runs
+
+
+@pytest.fixture(scope="module")
+def rows(cells, finished):
+    return {name: results.load_row(finished / cell.slug) for name, cell in cells.items()}
+
+
+def quality(row):
+    return {k: v for k, v in row["metric"].items() if not k.startswith("latency.")}
+
+
+def starting_with(prefixes, row):
+    return {k: v for k, v in quality(row).items() if k.startswith(prefixes)}
+
+
+# --- single tasks, side by side -------------------------------------------------------------------
+
+
+def test_a_single_task_row_has_the_quality_of_each_network(rows):
+    panoptic, depth = ("panoptic.", "semantic."), ("depth_median.", "depth.")
+    assert starting_with(panoptic, rows["apart"]) == quality(rows["panoptic"])
+    assert starting_with(depth, rows["apart"]) == starting_with(depth, rows["depth"])
+    assert starting_with(panoptic, rows["apart"])
+    assert starting_with(depth, rows["apart"])
+
+
+def test_its_depth_gets_its_scale_from_the_other_networks_road(rows):
+    assert rows["apart"]["protocol"]["dgc_ground"] == "predicted road"
+    assert rows["depth"]["protocol"]["dgc_ground"] == "normals"
+    assert (
+        rows["apart"]["protocol"]["depth_range_m"] == rows["together"]["protocol"]["depth_range_m"]
+    )
+
+
+def test_its_cost_is_that_of_both(rows):
+    alone = [rows["panoptic"], rows["depth"]]
+    for key in ("latency.params_m", "latency.gmacs"):
+        assert rows["apart"]["metric"][key] == pytest.approx(sum(r["metric"][key] for r in alone))
+        assert rows["apart"]["metric"][key] > rows["together"]["metric"][key]
+    weights_mib = sum(r["metric"]["latency.params_m"] for r in alone) * 4e6 / 2**20
+    assert rows["apart"]["metric"]["latency.peak_mib"] > weights_mib
+    for key in ("train_s", "step_ms"):
+        assert rows["apart"]["time"][key] == sum(row["time"][key] for row in alone)
+    assert rows["apart"]["time"]["peak_mib"] == max(row["time"]["peak_mib"] for row in alone)
+
+
+def test_a_single_task_run_is_evaluated_again_from_its_parents(cells, finished, rows, smoke_root):
+    directory = finished / cells["apart"].slug
+    assert not (directory / "last.pt").exists()
+    again = reevaluate(cells["apart"], directory / "last.pt", smoke_root, "cpu")
+    assert again.metrics == quality(rows["apart"])
+
+
+def test_a_row_says_what_kind_of_cell_it_is_of(rows):
+    found = {name: (row["single_task"], row["video"], row["tasks"]) for name, row in rows.items()}
+    both = ["panoptic", "depth"]
+    assert found["apart"] == (True, False, both)
+    assert found["video"] == (False, True, both)
+    assert found["depth"] == (False, False, ["depth"])
+    for row in rows.values():
+        assert 50 < row["time"]["peak_mib"] < 1e5
+
+
+# --- the video stage ------------------------------------------------------------------------------
+
+
+def test_the_video_stage_labels_every_frame_that_it_can(cells, finished, rows, smoke_root):
+    data = cells["video"].recipe.data
+    frames = data.train_scenes * (data.frames - 3)
+    assert rows["video"]["protocol"]["pseudo_frames"] == frames
+    assert rows["video"]["time"]["pseudo_s"] > 0
+    folder = finished / cells["video"].slug / "pseudo_labels"
+    assert len(list(folder.rglob("*_instanceIds.png"))) == frames
+    assert "pseudo_frames" not in rows["together"]["protocol"]
+
+
+def test_it_goes_on_from_its_parents_weights(cells, finished, rows):
+    before, after = (
+        checkpoint.read(finished / cells[name].slug / "last.pt") for name in ("together", "video")
+    )
+    (counter, *_) = [key for key in before["model"] if key.endswith("num_batches_tracked")]
+    steps = cells["video"].recipe.optim.steps
+    assert before["step"] == after["step"] == before["model"][counter] == steps
+    assert after["model"][counter] == 2 * steps
+    assert quality(rows["video"]) != quality(rows["together"])
+
+
+def test_it_trains_on_both_kinds_of_labels(cells, finished, smoke_root, tmp_path, monkeypatch):
+    from mtl_bench import train
+
+    copy_parent(cells, finished, tmp_path)
+    opened, open_dataset = [], train.open_dataset
+
+    def spy(*given, **settings):
+        opened.append(open_dataset(*given, **settings))
+        return opened[-1]
+
+    monkeypatch.setattr(train, "open_dataset", spy)
+    row = execute(cells["video"], tmp_path, smoke_root)
+    human = cells["video"].recipe.data.train_scenes
+    assert [len(dataset) for dataset in opened] == [human + row["protocol"]["pseudo_frames"]]
+
+
+def copy_parent(cells, finished, runs):
+    (runs / cells["together"].slug).mkdir(parents=True)
+    for name in ("row.json", "last.pt"):
+        source = finished / cells["together"].slug / name
+        (runs / cells["together"].slug / name).write_bytes(source.read_bytes())
+
+
+def crash_in_labels(monkeypatch):
+    write, count = pseudo_labels._write_frame, []
+
+    def some(*given):
+        count.append(1)
+        if len(count) > 5:
+            raise KeyboardInterrupt
+        write(*given)
+
+    monkeypatch.setattr(pseudo_labels, "_write_frame", some)
+
+
+def crash_in_training(monkeypatch):
+    save = checkpoint.save
+
+    def once(path, step, *given):
+        save(path, step, *given)
+        if step == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(checkpoint, "save", once)
+
+
+def crash_before_the_row(monkeypatch):
+    def never(*given, **settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mtl_bench.run.evaluate", never)
+
+
+@pytest.mark.parametrize("crash", [crash_in_labels, crash_in_training, crash_before_the_row])
+def test_stopped_anywhere_it_ends_with_the_same_row(
+    cells, finished, rows, smoke_root, tmp_path, monkeypatch, crash
+):
+    copy_parent(cells, finished, tmp_path)
+    with monkeypatch.context() as patched:
+        crash(patched)
+        with pytest.raises(KeyboardInterrupt):
+            execute(cells["video"], tmp_path, smoke_root)
+    assert results.status(cells["video"], tmp_path) == "interrupted"
+    row = execute(cells["video"], tmp_path, smoke_root)
+    assert quality(row) == quality(rows["video"])
+    assert row["protocol"] == rows["video"]["protocol"]
+    assert row["time"].keys() == rows["video"]["time"].keys()
+
+
+def test_a_signal_during_the_labels_stops_it(cells, finished, smoke_root, tmp_path, monkeypatch):
+    copy_parent(cells, finished, tmp_path)
+    update = "mtl_bench.progress.Progress.update"
+    monkeypatch.setattr(update, lambda self, stage, *given: setattr(self, "stop_asked", True))
+    with pytest.raises(Interrupted, match="stopped at pseudo label 0 of 16"):
+        execute(cells["video"], tmp_path, smoke_root)
+
+
+def test_a_fresh_start_forgets_the_labels(cells, finished, tmp_path):
+    folder = tmp_path / cells["video"].slug / "pseudo_labels" / "gtFine"
+    folder.mkdir(parents=True)
+    (tmp_path / cells["video"].slug / "taken.json").write_text("{}")
+    results.clear(tmp_path / cells["video"].slug)
+    assert list((tmp_path / cells["video"].slug).iterdir()) == []
+
+
+# --- parents that are not there -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gone", "word"),
+    [("last.pt", "without its checkpoint"), ("row.json", "interrupted"), ("", "stale")],
+)
+@pytest.mark.parametrize("child", ["video", "apart"])
+def test_a_parent_without_a_usable_result_is_one_line(
+    cells, finished, smoke_root, tmp_path, child, gone, word
+):
+    for parent in cells[child].parents:
+        (tmp_path / parent.slug).mkdir()
+        for name in {"row.json", "last.pt"} - {gone}:
+            content = (finished / parent.slug / name).read_bytes()
+            (tmp_path / parent.slug / name).write_bytes(content)
+        if not gone:
+            row = results.load_row(tmp_path / parent.slug)
+            row["code"]["harness"] = "another"
+            (tmp_path / parent.slug / "row.json").write_text(json.dumps(row))
+    slug = cells[child].parents[0].slug
+    with pytest.raises(ValueError, match=rf"this cell needs .*{slug}, which is {word}.*: run") as e:
+        execute(cells[child], tmp_path, smoke_root)
+    assert "\n" not in str(e.value)
+
+
+def test_side_by_side_gives_each_networks_outputs(cells, finished):
+    from mtl_bench.engine import Engine
+
+    engine = Engine(torch.device("cpu"), "fp32")
+    apart, panoptic, depth = (
+        load_model(cells[name], finished / cells[name].slug / "last.pt", engine).eval()
+        for name in ("apart", "panoptic", "depth")
+    )
+    image = torch.rand(2, 3, 32, 64)
+    both, first, second = (model.net(image) for model in (apart, panoptic, depth))
+    for name in ("semantic_BCHW", "center_B1HW", "offset_B2HW"):
+        assert torch.equal(getattr(both, name), getattr(first, name))
+    assert torch.equal(both.inverse_depth[0], second.inverse_depth[0])
+    assert apart.pose is None
