@@ -143,8 +143,8 @@ def _damped(C_KK: Tensor, b_K: Tensor, power: float, x_K: Tensor, step_K: Tensor
         y_K = x_K * (1 + size * step_K)
         return float((x_K * step_K) @ (C_KK @ y_K - b_K * y_K**-power))
 
-    size = min(1.0, 0.9 / max(0.9, float(-step_K.min())))
-    while step_K.abs().max() > 1e-3 and slope(size) > 0.5 * abs(slope(0.0)):
+    size, steepest = min(1.0, 0.9 / max(0.9, float(-step_K.min()))), abs(slope(0.0))
+    while step_K.abs().max() > 1e-3 and slope(size) > 0.5 * steepest and size > 1e-9:
         size /= 2
     return size * step_K
 

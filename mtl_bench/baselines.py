@@ -15,16 +15,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import ndimage
+from torch import Tensor
 
 from mtl_bench import config, postprocess
 from mtl_bench.data.cityscapes import Cityscapes
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE, LabelSet
 from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.data.targets import class_of_instance_id
-from mtl_bench.evaluate import Collector, Evaluation, Prediction, Progress
+from mtl_bench.evaluate import Collector, Evaluation, Prediction, Progress, true_size
 from mtl_bench.metrics.depth import evaluation_mask
 
-VERSION = 1  # raised when the predictors change
+VERSION = 2  # raised when the predictors change
 BATCH = 8
 
 
@@ -36,12 +37,12 @@ def baselines(
     progress: Progress | None = None,
     labels: LabelSet = CITYSCAPES20,
 ) -> Evaluation:
-    """The trivial predictors' metrics, keyed as `evaluate`'s, whatever the cell's tasks are.
+    """The trivial predictors' metrics, keyed as `evaluate`'s, of the cell's tasks.
 
     `depth_median` scales the mean depth image like any prediction. `depth_dgc` leaves it as it is:
     it is in metres already. Kept in `cache_dir`, one file for each data set and protocol.
     """
-    cell = dataclasses.replace(cell, tasks=config.TASKS, video=False)  # the truth of both tasks
+    cell = dataclasses.replace(cell, video=False, single_task=False)
     split = split or cell.recipe.evaluate.split
     training = open_dataset(cell, "train", root, training=False).uncached()
     dataset = open_dataset(cell, split, root, training=False).uncached()
@@ -51,6 +52,7 @@ def baselines(
         "data": config.to_dict(dataclasses.replace(cell.recipe.data, cache=False, workers=0)),
         "evaluate": config.to_dict(cell.recipe.evaluate),
         "labels": labels.name,
+        "tasks": list(cell.tasks),
         "frames": [split, *training.names, *dataset.names],
     }
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
@@ -67,12 +69,10 @@ def baselines(
             progress(done, total)
 
     average = _average(training, cell, labels, step)
-    class_HW, depth_m_HW = average.class_HW(), average.depth_m_HW()
     collector = Collector(cell, labels, len(dataset))
     for batch in eval_batches(dataset, BATCH):
-        count = len(batch.names)
-        collector.update(batch, _constant(class_HW, depth_m_HW, count, cell, labels))
-        step(count)
+        collector.update(batch, _constant(average, len(batch.names), cell, labels))
+        step(len(batch.names))
     evaluation = collector.result(split, torch.device("cpu"))
     evaluation.protocol |= {"engine": "none", "dgc_ground": "none: the mean depth is in metres"}
     evaluation.samples = {}
@@ -95,13 +95,15 @@ class Average:
         self.depth_sum = np.zeros(size)
         self.depth_count = np.zeros(size, np.int32)
 
-    def add(self, instance_ids_HW: NDArray, depth_m_HW: NDArray) -> None:
-        class_HW = self.class_of_id[instance_ids_HW]
-        for index in np.unique(class_HW[class_HW != IGNORE]):
-            self.votes[index] += class_HW == index
-        valid_HW = evaluation_mask(depth_m_HW, self.ev)
-        self.depth_sum += np.where(valid_HW, depth_m_HW, 0)
-        self.depth_count += valid_HW
+    def add(self, instance_ids_HW: Tensor | None, depth_m_HW: Tensor | None) -> None:
+        if instance_ids_HW is not None:
+            class_HW = self.class_of_id[instance_ids_HW.numpy()]
+            for index in np.unique(class_HW[class_HW != IGNORE]):
+                self.votes[index] += class_HW == index
+        if depth_m_HW is not None:
+            valid_HW = evaluation_mask(depth_m_HW.numpy(), self.ev)
+            self.depth_sum += np.where(valid_HW, depth_m_HW.numpy(), 0)
+            self.depth_count += valid_HW
 
     def class_HW(self) -> NDArray[np.uint8]:
         """IGNORE where no class was ever seen; ties go to the lowest."""
@@ -126,37 +128,37 @@ def _average(
     """Average a split's frames, which must have one size."""
     average = None
     for batch in eval_batches(training, BATCH):
-        if batch.instance_ids_BHW is None or batch.depth_m_BHW is None:
-            raise ValueError(f"no ground truth for {batch.names[0]} of the training split")
-        size = tuple(batch.depth_m_BHW.shape[1:])
+        ids = batch.instance_ids_BHW if "panoptic" in cell.tasks else None
+        depth = batch.depth_m_BHW if "depth" in cell.tasks else None
+        size = true_size(batch)
         average = average or Average(labels, cell.recipe.evaluate, size)
         if size != average.depth_sum.shape:
             raise ValueError(
                 f"{batch.names[0]} is {size}, frames before it {average.depth_sum.shape}: "
                 "an average image needs frames of one size"
             )
-        for ids, depth in zip(batch.instance_ids_BHW, batch.depth_m_BHW, strict=True):
-            average.add(ids.numpy(), depth.numpy())
+        for slot in range(len(batch.names)):
+            average.add(None if ids is None else ids[slot], None if depth is None else depth[slot])
         step(len(batch.names))
     if average is None:
         raise ValueError("the training split is empty")
     return average
 
 
-def _constant(
-    class_HW: NDArray, depth_m_HW: NDArray, count: int, cell: config.Cell, labels: LabelSet
-) -> Prediction:
+def _constant(average: Average, count: int, cell: config.Cell, labels: LabelSet) -> Prediction:
     """The same prediction for `count` frames, through the same post-processing as a network's."""
-    class_BHW = torch.from_numpy(class_HW).long().expand(count, -1, -1)
-    nothing_B1HW = torch.zeros(count, 1, *class_HW.shape)
-    nothing_B2HW = nothing_B1HW.expand(-1, 2, -1, -1)
-    panoptic_BHW = postprocess.panoptic(
-        class_BHW, nothing_B1HW, nothing_B2HW, labels.things, cell.recipe.evaluate
-    )
-    return Prediction(
-        class_BHW=class_BHW,
-        instance_ids_BHW=postprocess.to_instance_ids(panoptic_BHW, labels),
-        depth_B1HW=torch.from_numpy(depth_m_HW).expand(count, 1, -1, -1),
-        dgc_scale_B=torch.ones(count),
-        dgc_source_B=torch.full((count,), postprocess.ROAD),
-    )
+    prediction = Prediction()
+    if "panoptic" in cell.tasks:
+        class_BHW = torch.from_numpy(average.class_HW()).long().expand(count, -1, -1)
+        nothing_B2HW = torch.zeros(count, 2, *class_BHW.shape[1:])
+        panoptic_BHW = postprocess.panoptic(
+            class_BHW, nothing_B2HW[:, :1], nothing_B2HW, labels.things, cell.recipe.evaluate
+        )
+        prediction.class_BHW = class_BHW
+        prediction.instance_ids_BHW = postprocess.to_instance_ids(panoptic_BHW, labels)
+    if "depth" in cell.tasks:
+        depth_m_HW = torch.from_numpy(average.depth_m_HW())
+        prediction.depth_B1HW = depth_m_HW.expand(count, 1, -1, -1)
+        prediction.dgc_scale_B = torch.ones(count)
+        prediction.dgc_source_B = torch.full((count,), postprocess.ROAD)
+    return prediction

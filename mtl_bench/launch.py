@@ -28,7 +28,7 @@ CLAIMED = 75  # exit code of a cell that another process runs
 INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a cell that was told to stop
 POLL_S = 0.2
 GRACE_S = 30.0  # for a cell to save its state after Ctrl-C
-RERUN = ("stale", "failed", "all")
+RERUN = ("stale", "failed", "all", "latency")
 
 Command = Callable[[Cell], Sequence[str]]
 
@@ -38,10 +38,15 @@ def to_run(cells: Iterable[Cell], runs: Path, rerun: str | None = None) -> list[
 
     Args:
         rerun: `stale`: also those whose code changed. `failed`: those that failed begin at step 0
-            rather than at their checkpoint. `all`: every cell, from step 0.
+            rather than at their checkpoint. `all`: every cell, from step 0. `latency`: of those
+            that are done, only the latency.
     """
-    wanted = {"missing", "interrupted", "failed", "running"}
-    wanted |= {"stale"} if rerun == "stale" else set(results.WORDS) if rerun == "all" else set()
+    again: dict[str, list[str]] = {
+        "stale": ["stale"],
+        "all": [*results.WORDS],
+        "latency": ["done", "stale"],
+    }
+    wanted = {"missing", "interrupted", "failed", "running", *again.get(rerun or "", [])}
     own = [cell for cell in cells if results.status(cell, runs) in wanted]
     return [cell for cell in with_parents(own) if results.status(cell, runs) in wanted]
 
@@ -149,7 +154,9 @@ class Launcher:
         return state.word == "done" and row.stat().st_mtime > self._began
 
     def _start(self, job: Job, state: results.State) -> None:
-        if state.word == "stale" or self.rerun == "all" or self.rerun == state.word == "failed":
+        timed = self.rerun == "latency" and state.row is not None
+        fresh = self.rerun == "all" or state.word == "stale" or self.rerun == state.word == "failed"
+        if fresh and not timed:
             results.clear(job.directory)
         job.directory.mkdir(parents=True, exist_ok=True)
         for left_over in ("failed.json", "progress.json"):
@@ -158,7 +165,7 @@ class Launcher:
         job.began, job.progress = time.monotonic(), {}
         with (job.directory / "log.txt").open("ab") as log:
             job.process = subprocess.Popen(
-                self.command(job.cell),
+                [*self.command(job.cell), *(["--latency"] if timed else [])],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -12,22 +12,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from mtl_bench import checkpoint, provenance, pseudo_labels, results
+from mtl_bench import provenance, pseudo_labels, results
 from mtl_bench.config import Cell, to_dict
 from mtl_bench.curve import training_time
-from mtl_bench.data.labels import CITYSCAPES20, LabelSet
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.engine import Engine, choose_device
-from mtl_bench.evaluate import Evaluation, evaluate
-from mtl_bench.export_predictions import export_predictions
-from mtl_bench.latency import measure
-from mtl_bench.model import Model, side_by_side
+from mtl_bench.evaluate import evaluate
+from mtl_bench.model import Model
 from mtl_bench.progress import Interrupted, Progress
-from mtl_bench.quiet import SIDE_BY_SIDE
+from mtl_bench.stored import LABELS, load_model, time_cell
 from mtl_bench.tracking import Tracker
-from mtl_bench.train import CHECKPOINT, build, train
+from mtl_bench.train import CHECKPOINT, train
 
-LABELS = CITYSCAPES20
 TAKEN = "taken.json"  # what training took beside the curve's steps, for a run that is continued
 
 
@@ -84,10 +80,7 @@ def run_cell(
     _save_samples(run_dir / "samples.npz", evaluation.samples)
 
     progress.update("latency", 0, 1)
-    start = time.perf_counter()
-    with progress.quiet.alone(neighbours=SIDE_BY_SIDE in os.environ):
-        timing = time_cell(model, cell, root, engine)
-    latency_s = time.perf_counter() - start
+    timing, latency_s = time_cell(model, cell, root, engine, progress.quiet)
     echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
 
     row = {
@@ -194,75 +187,6 @@ def _training_protocol(cell: Cell, root: Path) -> dict[str, Any]:
     if "depth" not in cell.tasks:
         return {}
     return {"reprojection_mask": open_dataset(cell, "train", root, training=True).reprojection_mask}
-
-
-# --- stored models --------------------------------------------------------------------------------
-
-
-def reevaluate(
-    cell: Cell,
-    checkpoint_path: Path,
-    root: Path,
-    device: str = "auto",
-    split: str | None = None,
-    export: Path | None = None,
-) -> Evaluation:
-    """Evaluate a stored checkpoint again, on any split.
-
-    Args:
-        export: folder for the panoptic predictions, in Cityscapes' format.
-    """
-    engine = Engine(choose_device(device), cell.recipe.optim.precision)
-    model = load_model(cell, checkpoint_path, engine)
-    if export is not None:
-        export_predictions(model, cell, root, export, engine.device, split)
-    return evaluate(model, cell, root, engine.device, split)
-
-
-def load_model(cell: Cell, path: Path, engine: Engine, labels: LabelSet = LABELS) -> Model:
-    """A cell's model with the weights of a checkpoint.
-
-    Args:
-        path: the run's checkpoint. A single-task cell has none: its parents' are taken, in the
-            folders beside that one.
-
-    Raises:
-        ValueError: no readable checkpoint there, or one of another model.
-    """
-    if cell.single_task:
-        paths = [path.parent.parent / parent.slug / CHECKPOINT for parent in cell.parents]
-        pairs = zip(cell.parents, paths, strict=True)
-        return side_by_side([load_model(parent, file, engine, labels) for parent, file in pairs])
-    state = checkpoint.read(path)
-    model = build(cell, labels, engine)[0]
-    try:
-        model.load_state_dict(state["model"])
-    except RuntimeError as error:
-        why = str(error).splitlines()[1].strip()
-        raise ValueError(f"{path} is not of this cell's model: {why}") from None
-    return model
-
-
-def time_cell(model: Model, cell: Cell, root: Path, engine: Engine) -> dict[str, Any]:
-    """The latency protocol over the evaluation split's frames, on all of this process's cores."""
-    recipe = cell.recipe
-    threads = torch.get_num_threads()
-    torch.set_num_threads(max(threads, provenance.cores()))  # fewer where cells run side by side
-    dataset = open_dataset(cell, recipe.evaluate.split, root, training=False)
-    batches = [dataset.sample(index, None) for index in range(len(dataset))]
-    timing = measure(
-        model,
-        (sample.image_B3HW for sample in batches),
-        batches[0].K_B33,
-        float(batches[0].camera_height_m_B),
-        LABELS.things,
-        recipe.evaluate,
-        recipe.latency,
-        engine.device,
-        engine.precision,
-    )
-    torch.set_num_threads(threads)
-    return timing
 
 
 def _identity(cell: Cell) -> dict[str, Any]:

@@ -21,7 +21,7 @@ ORDER = (
     *("model", "postprocess", "losses", "method", "gradients", "backward", "engine"),
     *("checkpoint", "curve", "quiet", "progress", "tracking", "train"),
     *("metrics", "evaluate", "pseudo_labels", "baselines", "export_predictions", "latency"),
-    *("claim", "results", "run", "check"),
+    *("claim", "results", "stored", "run", "check"),
     *(
         "toml_file",
         "grids",

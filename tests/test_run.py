@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from typer.testing import CliRunner
 
-from mtl_bench import checkpoint, claim, pseudo_labels, results
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench import checkpoint, claim, launch, pseudo_labels, results
+from mtl_bench.cli import app
+from mtl_bench.config import Cell, load_recipe, to_dict
 from mtl_bench.grids import with_parents
 from mtl_bench.progress import Interrupted
-from mtl_bench.run import load_model, reevaluate, run_cell
+from mtl_bench.run import run_cell
+from mtl_bench.stored import load_model, reevaluate
 
 
 @pytest.fixture(scope="module")
@@ -253,3 +256,37 @@ def test_side_by_side_gives_each_networks_outputs(cells, finished):
         assert torch.equal(getattr(both, name), getattr(first, name))
     assert torch.equal(both.inverse_depth[0], second.inverse_depth[0])
     assert apart.pose is None
+
+
+# --- only the latency again -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["together", "apart"])
+def test_latency_alone_can_be_taken_again(name, cells, finished, rows, smoke_root, monkeypatch):
+    cell, before = cells[name], rows[name]
+    monkeypatch.setattr("mtl_bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
+    arguments = [str(finished / cell.slug / "cell.json"), "--latency", "--runs", str(finished)]
+    done = CliRunner().invoke(app, ["train", *arguments, "--data", str(smoke_root)])
+    assert done.exit_code == 0, done.output
+    assert "12.5 ms a frame" in done.output
+    after = results.load_row(finished / cell.slug)
+    assert after["metric"] == before["metric"] | {"latency.mean_ms": 12.5}
+    assert after["time"].keys() == before["time"].keys()
+    assert {k: after[k] for k in ("cell", "code", "env")} == {
+        k: before[k] for k in ("cell", "code", "env")
+    }
+    results.write_json(finished / cell.slug / "row.json", before)
+
+
+def test_there_is_no_latency_to_take_again_without_a_row(cells, tmp_path, smoke_root):
+    results.write_json(tmp_path / "cell.json", to_dict(cells["together"]))
+    arguments = ["train", str(tmp_path / "cell.json"), "--latency", "--runs", str(tmp_path)]
+    done = CliRunner().invoke(app, [*arguments, "--data", str(smoke_root)])
+    assert done.exit_code == 2
+    assert "no latency to take again" in done.output
+
+
+def test_a_grid_times_its_finished_cells_again(cells, finished):
+    todo = [cells["together"], replace(cells["together"], seed=7)]
+    assert launch.to_run(todo, finished, "latency") == todo
+    assert launch.to_run(todo, finished) == todo[1:]

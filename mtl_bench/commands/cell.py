@@ -64,6 +64,10 @@ def train(
     rerun: Annotated[
         bool, typer.Option("--rerun", help="Forget its earlier result or checkpoint.")
     ] = False,
+    latency: Annotated[
+        bool,
+        typer.Option("--latency", help="Of a cell that is done, only take the latency again."),
+    ] = False,
     data: o.DataOption = None,
     runs: o.RunsOption = Path("runs"),
     device: o.DeviceOption = o.Device.auto,
@@ -95,7 +99,29 @@ def train(
             granularity=granularity,
             pretrained=weights,
         )
-    run(override(cell, settings or []), data, runs, device.value, wandb.value, rerun, quiet)
+    cell = override(cell, settings or [])
+    if latency:
+        time_again(cell, data, runs, device.value, quiet)
+    else:
+        run(cell, data, runs, device.value, wandb.value, rerun, quiet)
+
+
+def time_again(cell: Cell, data: Path | None, runs: Path, device: str, quiet: bool) -> None:
+    """Measure a finished cell's latency anew."""
+    from mtl_bench import claim, launch, results
+
+    directory = results.run_dir(cell, runs)
+    if results.stored(cell, runs).row is None:
+        raise ValueError(f"no latency to take again: {directory} has no row.json yet")
+    root = o.data_root(cell, data, quiet)
+    try:
+        with claim.claim(directory):
+            from mtl_bench import stored
+
+            stored.time_again(cell, directory, root, device, o.echo(quiet))
+    except claim.ClaimedError as error:
+        typer.echo(f"mtl-bench: {error}", err=True)
+        raise typer.Exit(launch.CLAIMED) from None
 
 
 def run(
@@ -110,10 +136,7 @@ def run(
     if not rerun and _done_already(cell, runs):
         return
     root = o.data_root(cell, data, quiet)
-
-    def echo(line: str) -> None:
-        if not quiet:
-            typer.echo(line)
+    echo = o.echo(quiet)
 
     for parent in with_parents(cell.parents):
         state = results.inspect(parent, runs)
@@ -206,7 +229,7 @@ def evaluate(
     directory, checkpoint = (what, what / "last.pt") if what.is_dir() else (what.parent, what)
     cell = results.load_cell(directory / "cell.json")
     root = o.data_root(cell, data)
-    from mtl_bench.run import reevaluate
+    from mtl_bench.stored import reevaluate
 
     evaluation = reevaluate(cell, checkpoint, root, device.value, split, export)
     typer.echo(json.dumps(evaluation.metrics, indent=1))

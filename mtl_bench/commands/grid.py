@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +12,7 @@ import typer
 
 from mtl_bench.commands import options as o
 from mtl_bench.commands.choice import Choice
-from mtl_bench.config import Cell, to_dict
+from mtl_bench.config import TASKS, Cell, to_dict
 
 if TYPE_CHECKING:
     from mtl_bench.grids import Grid
@@ -21,6 +22,7 @@ class Rerun(StrEnum):
     stale = "stale"
     failed = "failed"
     all = "all"
+    latency = "latency"
 
 
 def register(app: typer.Typer) -> None:
@@ -52,7 +54,7 @@ def ablate(
         typer.Option(
             "--rerun",
             help="stale: run cells again whose code has changed. failed: begin failed ones at step "
-            "0, not at their checkpoint. all: run every cell again.",
+            "0, not at their checkpoint. all: run every cell again. latency: only time them again.",
             show_default=False,
         ),
     ] = None,
@@ -267,16 +269,23 @@ def _baseline(
 
     file.parent.mkdir(parents=True, exist_ok=True)
     root = o.data_root(grid.cells[0], data, quiet)
-    results.write_json(file, baselines(grid.cells[0], root, file.parent).metrics)
+    cell = replace(grid.cells[0], tasks=_tasks(grid), video=False, single_task=False)
+    results.write_json(file, baselines(cell, root, file.parent).metrics)
 
 
 def _baseline_file(grid: "Grid", runs: Path) -> Path | None:
     """Where they are kept; None for a grid over several data sets or protocols."""
+    tasks = _tasks(grid)
     settings = {
-        json.dumps([to_dict(cell.recipe.data), to_dict(cell.recipe.evaluate)])
+        json.dumps([to_dict(cell.recipe.data), to_dict(cell.recipe.evaluate), tasks])
         for cell in grid.cells
     }
     if len(settings) != 1:
         return None
     key = hashlib.sha256(settings.pop().encode()).hexdigest()[:12]
     return runs / "baselines" / f"trivial-{key}.json"
+
+
+def _tasks(grid: "Grid") -> tuple[str, ...]:
+    """Those that some cell has."""
+    return tuple(task for task in TASKS if any(task in cell.tasks for cell in grid.cells))

@@ -1,6 +1,6 @@
 """Options that several commands have, and what they mean."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -122,6 +122,11 @@ SmokeOption = Annotated[
         rich_help_panel=GRID,
     ),
 ]
+
+
+def echo(quiet: bool) -> Callable[[str], None]:
+    """Prints a line, or does not."""
+    return (lambda line: None) if quiet else typer.echo
 
 
 def weights(pretrained: str | None) -> str | None:

@@ -75,7 +75,7 @@ def pseudo_label(
 
     from mtl_bench import pseudo_labels
     from mtl_bench.engine import Engine, choose_device
-    from mtl_bench.run import load_model
+    from mtl_bench.stored import load_model
 
     engine = Engine(choose_device(device.value), cell.recipe.optim.precision)
     model = load_model(cell, weights, engine)
