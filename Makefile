@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: ablate test lint clean
+.PHONY: ablate test lint readme clean
 
 ablate: $(VENV)/installed
 	$(BIN)/mtl-bench ablate --grid backbones
@@ -15,6 +15,9 @@ lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+readme: $(VENV)/installed
+	$(BIN)/python -m mtl_bench.report.readme README.md reports
 
 $(VENV)/installed: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

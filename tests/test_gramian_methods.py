@@ -584,6 +584,7 @@ def test_state_goes_into_a_fresh_method(name):
 def test_imtl_is_its_two_halves():
     """By the engine, with scales that have moved: as imtl_l and imtl_g one after the other."""
     toy, method = Quadratics(TERMS), plugins.load("methods", "imtl")(TERMS, init=-0.3)
+    torch.testing.assert_close(method.loss.log_scale_T.data, torch.full((len(TERMS),), -0.3))
     with torch.no_grad():
         method.loss.log_scale_T += torch.linspace(-1, 1, len(TERMS))
     backward(method, [[toy.forward]], toy, lr=0.1)

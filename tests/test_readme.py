@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from mtl_bench.check import check
+from mtl_bench.grids import load_grid
 from mtl_bench.report import readme
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -16,16 +17,26 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
 
 @pytest.mark.parametrize(
     ("kind", "name", "marker"),
-    [("methods", "scale_invariant", "LossMethod"), ("backbones", "resnet34", "TimmBackbone")],
+    [("methods", "power_mean", "LossMethod"), ("backbones", "resnet34", "TimmBackbone")],
 )
 def test_example_passes_the_checks(kind, name, marker, tmp_path, monkeypatch):
     (source,) = [example for example in EXAMPLES if marker in example]
     folder = tmp_path / kind
     folder.mkdir()
-    (folder / f"readme_{name}.py").write_text(source)  # the example may ship under its own name
+    (folder / f"{name}.py").write_text(source)
     monkeypatch.setenv("MTL_BENCH_PLUGINS", str(tmp_path))
-    failed = [f"{r.name}: {r.detail}" for r in check(kind, f"readme_{name}") if not r.ok]
+    failed = [f"{r.name}: {r.detail}" for r in check(kind, name) if not r.ok]
     assert failed == []
+
+
+def test_the_example_grid_loads(tmp_path):
+    (source,) = re.findall(r"```toml\n(.*?)```", README.read_text(), re.DOTALL)
+    path = tmp_path / "mine.toml"
+    path.write_text(source)
+    grid = load_grid(str(path))
+    assert len(grid.cells) == 6
+    assert set(grid.names.values()) == {"Fixed", "Uncertainty, longer warm-up"}
+    assert {cell.recipe.optim.warmup_steps for cell in grid.cells} == {20, 100}
 
 
 def test_every_linked_file_exists():
@@ -55,7 +66,7 @@ def test_a_command_fills_in_all_results(tmp_path):
     assert done.stderr.startswith("error: no ")
     for name in "ab":
         (tmp_path / "reports" / name).mkdir(parents=True)
-        (tmp_path / "reports" / name / "table.md").write_text(f"table of {name}\n")
+        (tmp_path / "reports" / name / "readme.md").write_text(f"table of {name}\n")
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == "a: updated\nb: updated\n"
     text = path.read_text()
@@ -75,7 +86,7 @@ def test_a_grid_chooses_its_pictures(tmp_path, monkeypatch):
     )
     report = tmp_path / "reports" / "mine"
     report.mkdir(parents=True)
-    for name in ("table.md", "samples.png", "pq_fps.png"):
+    for name in ("readme.md", "samples.png", "pq_fps.png"):
         (report / name).touch()
     (tmp_path / "README.md").write_text("<!-- results:mine -->\n<!-- /results -->\n")
     text = readme.filled(tmp_path / "README.md", "mine", report)

@@ -192,7 +192,9 @@ def test_the_same_rows_give_the_same_bytes(built, tmp_path):
 
 def test_all_files_are_there_and_small(built):
     figures = {f"{stem}.{kind}" for stem in report.FIGURES for kind in ("png", "svg")}
-    expected = {"index.html", "table.csv", "table.md", "table.tex", *figures} - {"samples.svg"}
+    expected = {"index.html", "table.csv", "table.md", "readme.md", "table.tex", *figures} - {
+        "samples.svg"
+    }
     assert {path.name for path in built.out.iterdir()} == expected
     assert sum(path.stat().st_size for path in built.out.iterdir()) < 6e5
     for path in built.out.glob("*.png"):
@@ -337,7 +339,7 @@ def test_readme_takes_the_table_between_its_markers(built, tmp_path):
     path.write_text("# A\n<!-- results:backbones -->\nformer table\n<!-- /results -->\nafter\n")
     assert readme.update(path, "backbones", reports)
     text = path.read_text()
-    assert (reports / "table.md").read_text().strip() in text
+    assert (reports / "readme.md").read_text().strip() in text
     assert "(reports/backbones/pq_fps.png)" in text
     assert text.startswith("# A\n")
     assert text.endswith("<!-- /results -->\nafter\n")

@@ -44,7 +44,9 @@ def build(
     baseline: "Row | None" = None,
     command: str = "",
 ) -> Path:
-    """Write `index.html`, `table.{csv,md,tex}` and the figures; the same rows give the same bytes.
+    """Write the page, the tables and the figures; the same rows give the same bytes.
+
+    The tables are `table.{csv,md,tex}` whole and `readme.md` with the main columns.
 
     Args:
         grid: its name, question, recipe, and under `report` what `layout.Layout` says.
@@ -79,6 +81,7 @@ def build(
     files = {
         "table.csv": formats.csv(table),
         "table.md": formats.markdown(table),
+        "readme.md": formats.markdown(table, short=True),
         "table.tex": formats.latex(table),
         "index.html": page.render(grid, table, rows, figures, command, out_dir),
     }

@@ -31,6 +31,7 @@ TEX = {
 }
 ARROWS_TEX = {+1: r"$\uparrow$", -1: r"$\downarrow$"}
 IN_SUMMARY = ("pq", "abs_rel", "rmse", "fps")
+IN_README = ("pq", "miou", "abs_rel", "rmse", "rmse_dgc", "delta_task", "fps", "params_m")
 TITLES_TEX = {
     "delta1": r"$\delta_1$",
     "delta_flat": r"$\Delta$ flat",
@@ -102,12 +103,17 @@ def csv(table: Table) -> str:
     return pd.DataFrame(lines).to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
 
-def markdown(table: Table) -> str:
-    """Quality and cost, then what has no numbers, what others published, and the notes."""
+def markdown(table: Table, short: bool = False) -> str:
+    """Quality and cost, then what has no numbers, what others published, and the notes.
+
+    Args:
+        short: one table of the main columns in place of quality and cost, as for a README.
+    """
     parts = []
     if table.smoke:
         parts.append(f"**{SMOKE.capitalize()}.**")
-    for heading, columns in parts_of(table):
+    main = [column for column in table.columns() if column.name in IN_README]
+    for heading, columns in [("", main)] if short and main else parts_of(table):
         head = [f"{title(c)}<br>{c.note}" if c.note else title(c) for c in columns]
         lines = []
         for group in with_any(table, columns):
@@ -115,7 +121,8 @@ def markdown(table: Table) -> str:
             shown = [(entry(v, c, len(group.rows)), v.bold) for v, c in values]
             lines.append([*group.names, seeds(group), *(f"**{t}**" if b else t for t, b in shown)])
         names = [axis_title(axis) for axis in table.axes]
-        parts.append(f"**{heading}**\n\n{_grid([*names, 'n', *head], lines, len(names))}")
+        parts += [f"**{heading}**"] * bool(heading)
+        parts.append(_grid([*names, "n", *head], lines, len(names)))
     if table.unfinished:
         lines = [[cell.label, cell.status, cell.reason] for cell in table.unfinished]
         parts.append(f"**Without numbers**\n\n{_grid(['cell', 'status', 'why'], lines, 3)}")

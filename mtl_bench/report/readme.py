@@ -31,7 +31,7 @@ def filled(readme: Path, name: str, report_dir: Path) -> str:
     Raises:
         ValueError: no such markers, or no report to take the table from.
     """
-    table = report_dir / "table.md"
+    table = report_dir / "readme.md"
     if not table.is_file():
         raise ValueError(f"no {table}: make the report first (mtl-bench report --grid {name})")
     before = readme.read_text(encoding="utf-8")
