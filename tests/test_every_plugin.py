@@ -29,23 +29,55 @@ class Broken(LossMethod):
         super().__init__(terms, seed)
         self.count = 0
 
-    def total(self, loss_T):
+    def total(self, loss_K):
         self.count += 1
         {line}
 '''
+
+BROKEN_GRADIENT = '''"""A gradient method that is wrong.
+
+Source: nobody.
+"""
+import torch
+from mtl_bench.method import GradientMethod
+
+
+class Broken(GradientMethod):
+    def weights(self, G_KK, loss_K):
+        {line}
+'''
+
+
+def failed_checks(tmp_path, monkeypatch, text):
+    (tmp_path / "broken_one.py").write_text(text)
+    monkeypatch.setenv("MTL_BENCH_PLUGINS", str(tmp_path))
+    return [result.name for result in check("methods", "broken_one") if not result.ok]
 
 
 @pytest.mark.parametrize(
     ("line", "caught"),
     [
-        ("return -loss_T.sum()", "learns"),
-        ("return (loss_T / (loss_T - loss_T[0])).sum()", "finite on hard inputs"),
-        ("return loss_T.sum() * self.count", "state round trip"),
-        ("return (loss_T * torch.rand(len(loss_T))).sum()", "same seed, same update"),
+        ("return -loss_K.sum()", "learns"),
+        ("return (loss_K / (loss_K - loss_K[0])).sum()", "finite on hard inputs"),
+        ("return loss_K.sum() * self.count", "state round trip"),
+        ("return (loss_K * torch.rand(len(loss_K))).sum()", "same seed, same update"),
+        ("return 9 * loss_K[0] + loss_K.sum()", "order of losses"),
+        ("return (self.fixed_T * loss_K).sum()", "missing labels"),
     ],
 )
 def test_a_wrong_method_is_caught(tmp_path, monkeypatch, line, caught):
-    (tmp_path / "broken_one.py").write_text(BROKEN.format(line=line))
-    monkeypatch.setenv("MTL_BENCH_PLUGINS", str(tmp_path))
-    failed = [result.name for result in check("methods", "broken_one") if not result.ok]
-    assert caught in failed
+    assert caught in failed_checks(tmp_path, monkeypatch, BROKEN.format(line=line))
+
+
+@pytest.mark.parametrize(
+    ("line", "caught"),
+    [
+        ("return -torch.ones_like(loss_K)", "one loss is plain training"),
+        ("return 1 / G_KK.diagonal()", "finite on hard inputs"),
+        ("return torch.rand_like(loss_K)", "same seed, same update"),
+        ("return torch.arange(len(loss_K)) + 1.0", "order of losses"),
+        ("return self.fixed_T.double()", "missing labels"),
+    ],
+)
+def test_a_wrong_gradient_method_is_caught(tmp_path, monkeypatch, line, caught):
+    assert caught in failed_checks(tmp_path, monkeypatch, BROKEN_GRADIENT.format(line=line))

@@ -1,6 +1,7 @@
 """`list`, `new`, `check` and `env`: what there is, adding to it, and where it runs."""
 
 import textwrap
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ from typing import Annotated
 import typer
 
 from mtl_bench.commands import options as o
+from mtl_bench.plugins import Description
 
 
 class What(StrEnum):
@@ -36,9 +38,15 @@ def show(
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="With files and whole descriptions.")
     ] = False,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Methods as the page methods/README.md.")
+    ] = False,
     plugins: o.PluginsOption = None,
 ) -> None:
     """List methods, backbones, recipes and grids, without importing any."""
+    if markdown:
+        typer.echo(_page(what), nl=False)
+        return
     for kind in What if what is What.all else [what]:
         if kind is What.all:
             continue
@@ -49,22 +57,38 @@ def show(
 
 
 def _lines(kind: str, verbose: bool) -> list[str]:
-    from mtl_bench import config, grids
+    from mtl_bench import cards, config, grids
     from mtl_bench.plugins import describe
 
     if kind == "recipes":
         return o.columns([[name, config.load_recipe(name).about] for name in config.recipe_names()])
     if kind == "grids":
         return o.columns([[name, grids.question_of(name)] for name in grids.grid_names()])
-    found = describe(kind)
-    if not verbose:
-        return o.columns([[d.name, f"BROKEN: {d.error}" if d.error else d.summary] for d in found])
-    lines = []
-    for d in found:
-        lines += [f"  {d.name}  ({d.path})"]
-        lines += [f"    BROKEN: {d.error}"] if d.error else []
-        lines += [textwrap.indent(d.doc.rstrip(), "    "), ""]
-    return lines
+    if kind == "methods":
+        found = cards.cards()
+        if verbose:
+            return [line for card in found for line in _whole(card.about, cards.details(card))]
+        return [*o.columns(cards.rows(found)), f"  {cards.LEGEND}"]
+    described = describe(kind)
+    if verbose:
+        return [line for about in described for line in _whole(about)]
+    broken = {about.name: f"BROKEN: {about.error}" for about in described if about.error}
+    return o.columns([[about.name, broken.get(about.name, about.summary)] for about in described])
+
+
+def _whole(about: Description, details: Sequence[str] = ()) -> list[str]:
+    lines = [f"  {about.name}  ({about.path})"]
+    lines += [f"    BROKEN: {about.error}"] if about.error else []
+    lines += [f"    {line}" for line in details]
+    return [*lines, textwrap.indent(about.doc.rstrip(), "    "), ""]
+
+
+def _page(what: What) -> str:
+    from mtl_bench import cards, plugins
+
+    if what is not What.methods:
+        raise ValueError("only methods have a page: mtl-bench list methods --markdown")
+    return cards.page(cards.cards(), plugins.folders("methods")[0])
 
 
 def new(
