@@ -152,7 +152,7 @@ def _task_backwards(
         first.present = method.present
         first_K = _differentiate(first, loss_K, scale)[1] / scale
         J, loss = J * first_K[:, None], loss * first_K
-    if not torch.isfinite(J).all():  # an overflow of fp16: no state may learn from it
+    if not torch.isfinite(J.sum()):  # an overflow of fp16: no state may learn from it
         direction_P, weight_K = J.flatten(0, -2).sum(0), torch.ones_like(loss_K)
     elif isinstance(method, LookAheadMethod):
         look = _look_ahead(method, batches[1], model, first_K, lr)
@@ -259,7 +259,8 @@ def _add_own(
     own: Sequence[nn.Parameter], grads_K: Sequence[Sequence[Tensor | None]], weight_K: Tensor
 ) -> None:
     for weight, grads in zip(weight_K, grads_K, strict=True):
+        unit = weight == 1  # most often
         for parameter, grad in zip(own, grads, strict=True):
             if grad is not None:
-                grad = grad * weight.to(grad)
+                grad = grad if unit else grad * weight.to(grad)
                 parameter.grad = grad if parameter.grad is None else parameter.grad + grad

@@ -83,27 +83,31 @@ def task_gradients(
     seen, read = [], []
     for part in parts:
         passed = part()
-        seen.append(passed.losses)
+        seen.append({name: loss.detach() for name, loss in passed.losses.items()})
         mine, z = gather(passed.losses, method.terms), list(passed.representation)
+        del passed  # which holds the losses, too
         if in_z:
             read += z
+        z_grads_of = _through_decoders(mine, index_of, z, own, own_grads, scale)
+        like = z if in_z else shared
         if in_z or not blocks:  # filled row by row: a second copy may cost as much as the network
-            like = z if in_z else shared
-            blocks.append(z[0].new_zeros(len(method.terms), sum(x.numel() for x in like)).float())
-        for number, (name, value) in enumerate(mine.items(), 1):
-            keep, index = in_z or number < len(mine), index_of[name]
-            grads = torch.autograd.grad(
-                value * scale, [*z, *own], retain_graph=keep, allow_unused=True
-            )
-            z_grads = grads[: len(z)]
-            row = flatten(z_grads, z) if in_z else flatten(onward(z, z_grads, shared, keep), shared)
-            blocks[-1][index] += row
-            own_grads[index] = _sum(own_grads[index], grads[len(z) :])
+            new = torch.empty if len(z_grads_of) == len(method.terms) else torch.zeros
+            blocks.append(new(len(method.terms), sum(x.numel() for x in like), device=z[0].device))
+        for index in list(z_grads_of):
+            row, grads = blocks[-1][index], z_grads_of.pop(index)
+            if not in_z:
+                grads = onward(z, grads, shared, keep=len(z_grads_of) > 0)
+            if in_z or count_T[index] == 0:
+                flatten(grads, like, out=row)
+            else:
+                row += flatten(grads, like)
             count_T[index] += 1
     losses = mean_losses(seen)
     loss_K = stack_losses(method, losses)
     J_TP = blocks[0] if len(blocks) == 1 else torch.cat(blocks, 1)
-    J_TP /= (scale * count_T.clamp(min=1)).to(J_TP)[:, None]
+    divisor_T = scale * count_T.clamp(min=1)
+    if (divisor_T != 1).any():
+        J_TP /= divisor_T.to(J_TP)[:, None]
     here = method.present.tolist()
     return Gradients(
         method.present,
@@ -113,6 +117,29 @@ def task_gradients(
         [_divided(own_grads[i], int(count_T[i])) for i in here],
         trunk_backward(read, shared) if in_z else None,
     )
+
+
+def _through_decoders(
+    losses: dict[str, Tensor],
+    index_of: Mapping[str, int],
+    z: Sequence[Tensor],
+    own: Sequence[nn.Parameter],
+    own_grads: list[list[Tensor | None]],
+    scale: float,
+) -> dict[int, Sequence[Tensor | None]]:
+    """Gradients of what the decoders read, by loss; those of their parameters join `own_grads`.
+
+    All decoders come before the encoder, whose own passes need memory, too: a loss that is done
+    with leaves `losses` and takes its decoder's activations along.
+    """
+    found: dict[int, Sequence[Tensor | None]] = {}
+    for name in list(losses):
+        index, loss = index_of[name], losses.pop(name) * scale
+        keep = len(losses) > 0  # they may share a decoder
+        grads = torch.autograd.grad(loss, [*z, *own], retain_graph=keep, allow_unused=True)
+        found[index] = grads[: len(z)]
+        own_grads[index] = _sum(own_grads[index], grads[len(z) :])
+    return found
 
 
 def onward(
@@ -162,9 +189,11 @@ def trainable(parameters: Iterator[nn.Parameter]) -> list[nn.Parameter]:
     return [parameter for parameter in parameters if parameter.requires_grad]
 
 
-def flatten(grads: Sequence[Tensor | None], like: Sequence[Tensor]) -> Tensor:
+def flatten(
+    grads: Sequence[Tensor | None], like: Sequence[Tensor], out: Tensor | None = None
+) -> Tensor:
     parts = [torch.zeros_like(p) if g is None else g for g, p in zip(grads, like, strict=True)]
-    return torch.cat([part.flatten().float() for part in parts])
+    return torch.cat([part.flatten().float() for part in parts], out=out)
 
 
 def unflatten_into(direction_P: Tensor, parameters: Sequence[nn.Parameter]) -> None:
