@@ -47,7 +47,7 @@ class ExcessMTL(GradientMethod):
         square_KP = J_KP**2
         S_KP = self.squares.of(self.present, J_KP) + square_KP
         self.squares.keep(self.present, S_KP)
-        excess_K = (square_KP / (S_KP + 1e-7).sqrt()).sum(1).to(self.base_T)
+        excess_K = square_KP.div_((S_KP + 1e-7).sqrt_()).sum(1).to(self.base_T)
         weight_K = self._reweigh(excess_K).to(J_KP)
         return weight_K @ J_KP, weight_K
 

@@ -30,10 +30,10 @@ class GradDrop(GradientMethod):
         self.leak = leak
 
     def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
-        size_P = J_KP.abs().sum(0).clamp_min(torch.finfo(J_KP.dtype).tiny)
-        purity_P = (1 + J_KP.sum(0) / size_P) / 2
+        tiny, size_KP = torch.finfo(J_KP.dtype).tiny, J_KP.abs()
+        purity_P = (1 + J_KP.sum(0) / size_KP.sum(0).clamp_min(tiny)) / 2
         drawn_P = torch.rand(len(purity_P), dtype=J_KP.dtype, generator=self.generator)
         positive_P = purity_P > drawn_P.to(J_KP.device)
-        kept_KP = torch.where((J_KP > 0) == positive_P, J_KP, self.leak * J_KP)
-        absolute_K = J_KP.abs().sum(1).clamp_min(torch.finfo(J_KP.dtype).tiny)
-        return kept_KP.sum(0), kept_KP.abs().sum(1) / absolute_K
+        part_KP = ((J_KP > 0) == positive_P).to(J_KP).clamp_min(self.leak)
+        absolute_K = size_KP.sum(1).clamp_min(tiny)
+        return (J_KP * part_KP).sum(0), size_KP.mul_(part_KP).sum(1) / absolute_K
