@@ -73,6 +73,7 @@ def test_a_wrong_method_is_caught(tmp_path, monkeypatch, line, caught):
     ("line", "caught"),
     [
         ("return -torch.ones_like(loss_K)", "one loss is plain training"),
+        ("return -torch.ones_like(loss_K)", "learns"),
         ("return 1 / G_KK.diagonal()", "finite on hard inputs"),
         ("return torch.rand_like(loss_K)", "same seed, same update"),
         ("return torch.arange(len(loss_K)) + 1.0", "order of losses"),
