@@ -17,10 +17,12 @@ LINES = 300
 
 # A module imports only from rooms before its own (or from its own).
 ORDER = (
-    *("plain", "config", "plugins", "cards", "provenance", "data", "geometry", "depth_scale"),
-    *("model", "postprocess", "losses", "method", "gradients", "backward", "engine"),
+    *("plain", "recipe", "config", "plugins", "cards", "provenance", "data", "geometry"),
+    *("depth_scale", "model", "grouping", "postprocess", "finish"),
+    *("losses", "method", "gradients", "backward", "engine"),
     *("checkpoint", "curve", "quiet", "progress", "tracking", "train"),
-    *("metrics", "evaluate", "pseudo_labels", "baselines", "export_predictions", "latency"),
+    *("metrics", "protocols", "evaluate", "pseudo_labels", "baselines", "export_predictions"),
+    *("export", "engines", "latency", "render", "predict"),
     *("claim", "results", "stored", "run", "check"),
     *(
         "toml_file",
@@ -36,7 +38,7 @@ ORDER = (
 )
 
 # The pose network's encoder is the paper's, whatever the backbone is.
-POSE = {("config.py", "resnet18"), ("model/pose.py", "resnet18")}
+POSE = {("recipe.py", "resnet18"), ("model/pose.py", "resnet18")}
 
 
 def relative(path: Path) -> str:
