@@ -3,8 +3,8 @@
 Source: Chen, Fernando, Ying, Chen, Three-Way Trade-Off in Multi-Objective Learning: Optimization,
 Generalization and Conflict-Avoidance, NeurIPS 2023, arXiv:2305.20057, algorithm 1. Independent
 batches make J_1 J_2^T an unbiased estimate, which a batch's Gramian is not. The paper may train on
-the two batches again; here it is always a third. LibMTL adds up the decoders' gradients of the
-three batches; here they are averaged.
+the two batches again; here it is always a third. LibMTL trains the decoders on all three batches,
+here on the third.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from mtl_bench.losses.terms import Term
-from mtl_bench.method import GradientMethod
+from mtl_bench.method import CrossMethod
 
 from ._simplex import descend
 
 
-class MoDo(GradientMethod):
+class MoDo(CrossMethod):
     """d = J_3^T l with l <- Pi(l - gamma (J_1 J_2^T + rho) l)
 
     Args:
@@ -26,7 +26,6 @@ class MoDo(GradientMethod):
         rho: pulls lambda towards equal weights; 0.1 in both; 0 is the bare algorithm.
     """
 
-    batches = 3
     lambda_T: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0, gamma: float = 0.1, rho: float = 0.1):
@@ -35,10 +34,8 @@ class MoDo(GradientMethod):
         equal_T = torch.full((len(terms),), 1 / len(terms), dtype=torch.float64)
         self.register_buffer("lambda_T", equal_T)
 
-    def direction(self, J_NKP: Tensor, loss_NK: Tensor) -> tuple[Tensor, Tensor]:
-        A_KK = (J_NKP[0] @ J_NKP[1].T).double().cpu()
-        lambda_K = self.lambda_T[self.present].cpu()
-        lambda_K = descend(lambda_K, self.gamma * (A_KK @ lambda_K + self.rho * lambda_K))
+    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+        lambda_K = self.lambda_T[self.present].to(G_KK)
+        lambda_K = descend(lambda_K, self.gamma * (G_KK @ lambda_K + self.rho * lambda_K))
         self.lambda_T[self.present] = lambda_K.to(self.lambda_T)
-        weight_K = lambda_K.to(J_NKP)
-        return weight_K @ J_NKP[2], weight_K
+        return lambda_K

@@ -27,7 +27,6 @@ class Nash(GradientMethod):
         max_norm: of the shared direction, 1 in the authors' code; inf clips nothing.
     """
 
-    weighted_heads = True
     weight_T: Tensor
     step: Tensor
 
@@ -43,8 +42,9 @@ class Nash(GradientMethod):
         if self.step % self.every == 0:
             self.weight_T[self.present] = fair(G_KK, power=1.0).to(self.weight_T)
         self.step += 1
-        return self.weight_T[self.present]
+        weight_K = self.weight_T[self.present].to(G_KK)
+        norm = (weight_K @ G_KK @ weight_K).clamp_min(0).sqrt()  # of the shared direction
+        return weight_K * (self.max_norm / norm).clamp(max=1.0)
 
-    def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
-        direction_P, weight_K = super().direction(J_KP, loss_K)
-        return direction_P * (self.max_norm / direction_P.norm()).clamp(max=1.0), weight_K
+    def head_weights(self, weight_K: Tensor, loss_K: Tensor) -> Tensor:
+        return self.weight_T[self.present].to(weight_K)

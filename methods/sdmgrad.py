@@ -4,8 +4,7 @@ Source: Xiao, Ban, Ji, Direction-oriented Multi-objective Learning: Simple and P
 Algorithms, NeurIPS 2023, arXiv:2305.18409, algorithm 1 with the average as target. Two independent
 batches estimate the inner objective without bias, the third trains. As in public code, the matrix
 is divided by the squared mean gradient norm, so that `lr` means the same at every scale, and the
-direction by 1 + lambda. LibMTL adds up the decoders' gradients of the three batches; here they are
-averaged.
+direction by 1 + lambda. LibMTL trains the decoders on all three batches, here on the third.
 """
 
 from collections.abc import Sequence
@@ -14,13 +13,13 @@ import torch
 from torch import Tensor
 
 from mtl_bench.losses.terms import Term
-from mtl_bench.method import GradientMethod
+from mtl_bench.method import CrossMethod
 
 from ._simplex import descend
 from ._solvers import project_on_simplex
 
 
-class SDMGrad(GradientMethod):
+class SDMGrad(CrossMethod):
     """d = J_3^T (w + lam / K) / (1 + lam) with w <- Pi(w - lr v), v the momentum of A (w + lam / K)
 
     A = J_1 J_2^T, scaled; w starts from the last step's.
@@ -30,7 +29,6 @@ class SDMGrad(GradientMethod):
         lr, momentum, iterations: of the inner descent; 10 (LibMTL: 5), 0.5 and 20.
     """
 
-    batches = 3
     w_T: Tensor
 
     def __init__(
@@ -46,15 +44,13 @@ class SDMGrad(GradientMethod):
         self.lam, self.lr, self.momentum, self.iterations = lam, lr, momentum, iterations
         self.register_buffer("w_T", torch.full((len(terms),), 1 / len(terms), dtype=torch.float64))
 
-    def direction(self, J_NKP: Tensor, loss_NK: Tensor) -> tuple[Tensor, Tensor]:
-        A_KK = (J_NKP[0] @ J_NKP[1].T).double().cpu()
-        scale = A_KK.diagonal().clamp_min(0).sqrt().mean()  # norms; noise can make them negative
-        A_KK = A_KK / scale**2 if scale > 0 else A_KK
-        w_K = project_on_simplex(self.w_T[self.present].cpu())  # a start: absent tasks drop out
+    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+        scale = G_KK.diagonal().clamp_min(0).sqrt().mean()  # norms; noise can make them negative
+        A_KK = G_KK / scale**2 if scale > 0 else G_KK
+        w_K = project_on_simplex(self.w_T[self.present].to(A_KK))  # a start: absent tasks drop out
         velocity_K = torch.zeros_like(w_K)
         for _ in range(self.iterations):
             velocity_K = self.momentum * velocity_K + A_KK @ (w_K + self.lam / len(A_KK))
             w_K = descend(w_K, self.lr * velocity_K)
         self.w_T[self.present] = w_K.to(self.w_T)
-        weight_K = ((w_K + self.lam / len(w_K)) / (1 + self.lam)).to(J_NKP)
-        return weight_K @ J_NKP[2], weight_K
+        return (w_K + self.lam / len(w_K)) / (1 + self.lam)

@@ -167,6 +167,8 @@ def _cost(line: Sequence[ast.ClassDef]) -> str:
     values, needs = _declared(line), _needs(line)
     if needs == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
+    if _is_a(line, "CrossMethod"):  # decoders' own parameters only of the third
+        return "3F + 2K(H + T) + KH + 1T"
     batches = values["batches"]
     each = "" if batches == 1 else batches
     if needs == "representation":

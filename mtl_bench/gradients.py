@@ -7,6 +7,7 @@ Shapes: T losses of the method, K of them in this batch, P numbers in the method
 """
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,6 +15,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from mtl_bench.jacobian import Gradient, add, divided, flatten
 from mtl_bench.losses.terms import gather
 from mtl_bench.method import GradientMethod, Method
 
@@ -46,6 +48,12 @@ def mean_losses(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.stack(values).mean(0) for name, values in found.items()}
 
 
+def losses_of(parts: Sequence[Forward], model: Split) -> list[Mapping[str, Tensor]]:
+    """Each part's loss terms under the present parameters; leaves no trace in the model."""
+    with torch.no_grad(), frozen_statistics(model):
+        return [part().losses for part in parts]
+
+
 def stack_losses(method: Method, losses: Mapping[str, Tensor]) -> Tensor:
     """The method's losses [K], in its order; tells the method which K of its T they are."""
     mine = gather(losses, method.terms)
@@ -65,107 +73,157 @@ class Gradients:
     present: Tensor  # which losses of the method the K are
     losses: dict[str, Tensor]
     loss_K: Tensor
-    J_KP: Tensor
+    rows: list[list[Tensor | None]]  # K x tensors of the method's space; of a matrix, its rows
+    J_KP: Tensor | None  # the same as one matrix, where it was asked for
+    space: Sequence[Tensor]  # the tensors of the method's space
     own: list[list[Tensor | None]]  # K x parameters
-    trunk: Callable[[Tensor], None] | None  # in the space of the representation: the way on
+    back: Callable[[Gradient], None]  # puts a direction, as a row has it, into `.grad`
 
 
 def task_gradients(
-    method: GradientMethod, parts: Sequence[Forward], model: Split, scale: float
+    method: GradientMethod,
+    parts: Sequence[Forward],
+    model: Split,
+    scale: float,
+    matrix: bool = False,
+    own: bool = True,
 ) -> Gradients:
-    """Each loss's gradient, averaged over the parts of the batch that have the loss."""
-    shared, own = trainable(model.shared_parameters()), trainable(model.task_parameters())
-    in_z = method.space == "representation"
-    blocks: list[Tensor] = []  # each T x numbers; of parameters one, of representations one a part
-    own_grads: list[list[Tensor | None]] = [[None] * len(own) for _ in method.terms]
+    """Each loss's gradient, averaged over the parts of the batch that have the loss.
+
+    Args:
+        scale: of the losses before they are differentiated; the results are free of it.
+        matrix: one matrix in place of rows.
+        own: those of the parameters that are not shared, too.
+    """
+    shared = trainable(model.shared_parameters())
+    others = trainable(model.task_parameters()) if own else []
+    kept = (_Representations if method.space == "representation" else _Parameters)(
+        shared, len(method.terms), matrix
+    )
+    own_T: list[list[Tensor | None]] = [[None] * len(others) for _ in method.terms]
     index_of = {term.name: index for index, term in enumerate(method.terms)}
-    count_T = torch.zeros(len(method.terms))
-    seen, read = [], []
+    count: Counter[int] = Counter()
+    seen = []
     for part in parts:
         passed = part()
         seen.append({name: loss.detach() for name, loss in passed.losses.items()})
         mine, z = gather(passed.losses, method.terms), list(passed.representation)
         del passed  # which holds the losses, too
-        if in_z:
-            read += z
-        z_grads_of = _through_decoders(mine, index_of, z, own, own_grads, scale)
-        like = z if in_z else shared
-        if in_z or not blocks:  # filled row by row: a second copy may cost as much as the network
-            new = torch.empty if len(z_grads_of) == len(method.terms) else torch.zeros
-            blocks.append(new(len(method.terms), sum(x.numel() for x in like), device=z[0].device))
-        for index in list(z_grads_of):
-            row, grads = blocks[-1][index], z_grads_of.pop(index)
-            if not in_z:
-                grads = onward(z, grads, shared, keep=len(z_grads_of) > 0)
-            if in_z or count_T[index] == 0:
-                flatten(grads, like, out=row)
-            else:
-                row += flatten(grads, like)
-            count_T[index] += 1
+        z_grads_of = through_decoders(mine, index_of, z, others, own_T, scale)
+        count.update(z_grads_of.keys())
+        kept.add(z, z_grads_of)
     losses = mean_losses(seen)
     loss_K = stack_losses(method, losses)
-    J_TP = blocks[0] if len(blocks) == 1 else torch.cat(blocks, 1)
-    divisor_T = scale * count_T.clamp(min=1)
-    if (divisor_T != 1).any():
-        J_TP /= divisor_T.to(J_TP)[:, None]
     here = method.present.tolist()
-    return Gradients(
-        method.present,
-        losses,
-        loss_K,
-        J_TP if len(here) == len(J_TP) else J_TP[method.present],
-        [_divided(own_grads[i], int(count_T[i])) for i in here],
-        trunk_backward(read, shared) if in_z else None,
-    )
+    counts = [count[i] for i in here]
+    rows, J_KP = kept.found(here, [scale * n for n in counts])
+    own_K = [divided(own_T[i], n) for i, n in zip(here, counts, strict=True)]
+    return Gradients(method.present, losses, loss_K, rows, J_KP, kept.space, own_K, kept.back)
 
 
-def _through_decoders(
+class _Parameters:
+    """Gradients of the shared parameters, added up over the parts."""
+
+    def __init__(self, shared: Sequence[nn.Parameter], losses: int, matrix: bool):
+        self.shared = self.space = shared
+        self.rows: list[list[Tensor | None]] = [[] for _ in range(losses)]
+        self.begun: set[int] = set()
+        self.J_TP: Tensor | None = None
+        if matrix:  # filled row by row: a second copy may cost as much as the network
+            P = sum(parameter.numel() for parameter in shared)
+            self.J_TP = torch.zeros(losses, P, device=shared[0].device)
+
+    def add(self, z: Sequence[Tensor], z_grads_of: dict[int, Gradient]) -> None:
+        for index in list(z_grads_of):
+            grads = onward(z, z_grads_of.pop(index), self.shared, keep=len(z_grads_of) > 0)
+            first = index not in self.begun
+            self.begun.add(index)
+            if self.J_TP is None:
+                self.rows[index] = list(grads) if first else add(self.rows[index], grads)
+            elif first:
+                flatten(grads, self.shared, out=self.J_TP[index])
+            else:
+                self.J_TP[index] += flatten(grads, self.shared)
+
+    def found(
+        self, here: Sequence[int], divisors: Sequence[float]
+    ) -> tuple[list[list[Tensor | None]], Tensor | None]:
+        if self.J_TP is None:
+            return [divided(self.rows[i], n) for i, n in zip(here, divisors, strict=True)], None
+        J_KP = self.J_TP if len(here) == len(self.J_TP) else self.J_TP[list(here)]
+        for row, divisor in zip(J_KP, divisors, strict=True):
+            if divisor != 1:
+                row /= divisor
+        return [[row] for row in J_KP], J_KP
+
+    def back(self, direction: Gradient) -> None:
+        for parameter, grad in zip(self.shared, direction, strict=True):
+            parameter.grad = grad
+
+
+class _Representations:
+    """Gradients of what the decoders read: the parts' tensors stand side by side."""
+
+    def __init__(self, shared: Sequence[nn.Parameter], losses: int, matrix: bool):
+        self.shared, self.matrix = shared, matrix
+        self.space: list[Tensor] = []
+        self.rows: list[list[Tensor | None]] = [[] for _ in range(losses)]
+
+    def add(self, z: Sequence[Tensor], z_grads_of: dict[int, Gradient]) -> None:
+        self.space += z
+        for index, row in enumerate(self.rows):
+            row += z_grads_of.get(index, [None] * len(z))
+
+    def found(
+        self, here: Sequence[int], divisors: Sequence[float]
+    ) -> tuple[list[list[Tensor | None]], Tensor | None]:
+        rows = [divided(self.rows[i], n) for i, n in zip(here, divisors, strict=True)]
+        if not self.matrix:
+            return rows, None
+        J_KP = torch.stack([flatten(row, self.space) for row in rows])
+        return [[row] for row in J_KP], J_KP
+
+    def back(self, direction: Gradient) -> None:
+        grads = onward(self.space, direction, self.shared, False)
+        for parameter, grad in zip(self.shared, grads, strict=True):
+            parameter.grad = grad
+
+
+def through_decoders(
     losses: dict[str, Tensor],
     index_of: Mapping[str, int],
     z: Sequence[Tensor],
     own: Sequence[nn.Parameter],
     own_grads: list[list[Tensor | None]],
     scale: float,
-) -> dict[int, Sequence[Tensor | None]]:
+) -> dict[int, Gradient]:
     """Gradients of what the decoders read, by loss; those of their parameters join `own_grads`.
 
     All decoders come before the encoder, whose own passes need memory, too: a loss that is done
     with leaves `losses` and takes its decoder's activations along.
     """
-    found: dict[int, Sequence[Tensor | None]] = {}
+    found: dict[int, Gradient] = {}
     for name in list(losses):
         index, loss = index_of[name], losses.pop(name) * scale
         keep = len(losses) > 0  # they may share a decoder
         grads = torch.autograd.grad(loss, [*z, *own], retain_graph=keep, allow_unused=True)
         found[index] = grads[: len(z)]
-        own_grads[index] = _sum(own_grads[index], grads[len(z) :])
+        own_grads[index] = add(own_grads[index], grads[len(z) :])
     return found
 
 
 def onward(
     z: Sequence[Tensor],
-    z_grads: Sequence[Tensor | None],
+    z_grads: Gradient,
     shared: Sequence[nn.Parameter],
     keep: bool,
-) -> Sequence[Tensor | None]:
+) -> Gradient:
     """Gradients of the shared parameters from those of what the decoders read."""
     reached = [(x, g) for x, g in zip(z, z_grads, strict=True) if g is not None]
     if not reached:
         return [None] * len(shared)
     outputs, grads = zip(*reached, strict=True)
     return torch.autograd.grad(outputs, shared, grads, retain_graph=keep, allow_unused=True)
-
-
-def trunk_backward(z: Sequence[Tensor], shared: Sequence[nn.Parameter]) -> Callable[[Tensor], None]:
-    """Takes a direction in the representation on to `.grad` of the shared parameters."""
-
-    def run(direction_P: Tensor) -> None:
-        pieces = direction_P.split([x.numel() for x in z])
-        z_grads = [piece.view_as(x).to(x) for piece, x in zip(pieces, z, strict=True)]
-        for parameter, grad in zip(shared, onward(z, z_grads, shared, False), strict=True):
-            parameter.grad = grad
-
-    return run
 
 
 # --- small parts ----------------------------------------------------------------------------------
@@ -187,26 +245,3 @@ def frozen_statistics(model: Split) -> Iterator[None]:
 
 def trainable(parameters: Iterator[nn.Parameter]) -> list[nn.Parameter]:
     return [parameter for parameter in parameters if parameter.requires_grad]
-
-
-def flatten(
-    grads: Sequence[Tensor | None], like: Sequence[Tensor], out: Tensor | None = None
-) -> Tensor:
-    parts = [torch.zeros_like(p) if g is None else g for g, p in zip(grads, like, strict=True)]
-    return torch.cat([part.flatten().float() for part in parts], out=out)
-
-
-def unflatten_into(direction_P: Tensor, parameters: Sequence[nn.Parameter]) -> None:
-    parts = direction_P.split([p.numel() for p in parameters])
-    for parameter, part in zip(parameters, parts, strict=True):
-        parameter.grad = part.view_as(parameter).to(parameter)
-
-
-def _divided(grads: list[Tensor | None], count: int) -> list[Tensor | None]:
-    return grads if count == 1 else [g if g is None else g / count for g in grads]
-
-
-def _sum(total: Sequence[Tensor | None], grads: Sequence[Tensor | None]) -> list[Tensor | None]:
-    return [
-        b if a is None else a if b is None else a + b for a, b in zip(total, grads, strict=True)
-    ]

@@ -90,7 +90,7 @@ class GradientMethod(Method):
     def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
         """Update direction [P] of the shared parameters, and the weights [K] to log.
 
-        With `batches` above 1, gradients and losses have a leading axis: J_NKP, loss_NK.
+        Where a method does not override this, the same comes about without the matrix J.
         """
         G_KK = (J_KP @ J_KP.T).double().cpu()
         weight_K = self.weights(G_KK, loss_K.double().cpu()).to(J_KP)
@@ -99,6 +99,23 @@ class GradientMethod(Method):
     def head_weights(self, weight_K: Tensor, loss_K: Tensor) -> Tensor:
         """Weights [K] of each loss for the parameters that are not shared."""
         return weight_K if self.weighted_heads else torch.ones_like(weight_K)
+
+
+class CrossMethod(GradientMethod):
+    """A gradient method whose weights come from two batches, and train on a third.
+
+    Of independent batches, J_1 J_2^T estimates the Gramian of the expected gradients without bias;
+    J_1 J_1^T would not. The third batch needs no gradients of single losses for what is shared.
+    Override `weights`, whose G_KK is J_1 J_2^T here and whose losses are the two batches' mean.
+    """
+
+    batches = 3
+
+    def direction(self, J_NKP: Tensor, loss_NK: Tensor) -> tuple[Tensor, Tensor]:
+        """What the three batches' gradients J_1, J_2, J_3 lead to."""
+        A_KK = (J_NKP[0] @ J_NKP[1].T).double().cpu()
+        weight_K = self.weights(A_KK, loss_NK[:2].mean(0).double().cpu()).to(J_NKP)
+        return weight_K @ J_NKP[2], weight_K
 
 
 class LookAheadMethod(GradientMethod):

@@ -20,7 +20,10 @@ HARNESS = (  # what numbers depend on; the rest launches, stores or shows
     "losses",
     "metrics",
     "method.py",
+    "jacobian.py",
     "gradients.py",
+    "weighting.py",
+    "by_gradients.py",
     "backward.py",
     "engine.py",
     "geometry.py",
@@ -51,10 +54,10 @@ def code(cell: Cell) -> dict[str, str]:
     }
 
 
-def harness_fingerprint(package: Path = PACKAGE) -> str:
+def harness_fingerprint(package: Path = PACKAGE, names: tuple[str, ...] = HARNESS) -> str:
     """12 hexadecimal digits of the modules that produce numbers."""
     digest = hashlib.sha256()
-    for name in HARNESS:
+    for name in names:
         paths = sorted((package / name).rglob("*.py")) or [package / name]
         for path in filter(Path.is_file, paths):
             digest.update(path.relative_to(package).as_posix().encode() + b"\0")

@@ -11,7 +11,7 @@ from mtl_bench.backward import Pass, backward, losses_now
 from mtl_bench.check.methods import TERMS, Quadratics
 from mtl_bench.gradients import frozen_statistics
 from mtl_bench.losses.terms import gather, terms_of
-from mtl_bench.method import Composed, GradientMethod, LookAheadMethod, LossMethod
+from mtl_bench.method import Composed, CrossMethod, GradientMethod, LookAheadMethod, LossMethod
 
 
 class Sum(LossMethod):
@@ -279,13 +279,11 @@ def test_composition_travels_in_a_checkpoint():
 
 
 def test_independent_batches_are_compared_in_the_losses_that_all_have():
-    class Last(GradientMethod):
-        batches = 3
-
-        def direction(self, J_NKP, loss_NK):
-            assert J_NKP.shape[:2] == loss_NK.shape == (3, 2)
+    class Last(CrossMethod):
+        def weights(self, G_KK, loss_K):
+            assert G_KK.shape == (2, 2)
             assert self.present.tolist() == [0, 4]
-            return J_NKP[2].sum(0), torch.ones(2)
+            return torch.ones_like(loss_K)
 
     net, names = TinyNet(), [term.name for term in TERMS]
     lists = (names, [names[0], names[4]], names[:1] + names[3:])
@@ -296,8 +294,68 @@ def test_independent_batches_are_compared_in_the_losses_that_all_have():
     backward(SumOfGradients(TERMS), [[partial(one_batch, X, lists[1])]], one_batch)
     for one, two in zip(net.parameters(), one_batch.parameters(), strict=True):
         torch.testing.assert_close(one.grad, two.grad)
+
+
+def cross_toy(kind, parts, scale=1.0):
+    """Gradients of a step over three batches, and its weights."""
+    net, method = TinyNet(), kind(TERMS)
+    weighting = backward(method, [[partial(net, x) for x in xs] for xs in parts], net, scale=scale)
+    found = [parameter.grad / scale for parameter in net.parameters()]
+    return found, weighting
+
+
+class ByCross(CrossMethod):
+    """Weights that depend on all of the matrix, which is not symmetric."""
+
+    def weights(self, G_KK, loss_K):
+        assert G_KK.dtype == torch.float64
+        return 1 + G_KK[0].abs() / (1 + G_KK.abs().sum()) + 0.1 * loss_K
+
+
+class ByCrossWithHeads(ByCross):
+    weighted_heads = True
+
+
+@pytest.mark.parametrize("kind", [ByCross, ByCrossWithHeads])
+def test_cross_weights_come_from_two_batches_and_train_on_a_third(kind):
+    batches = [X[:4], X[4:8], X[8:]]
+    found, weighting = cross_toy(kind, [[x] for x in batches])
+    net, J, losses = TinyNet(), [], []
+    shared, own = list(net.shared_parameters()), list(net.task_parameters())
+    for x in batches:
+        values = list(net(x).losses.values())
+        rows = [torch.autograd.grad(v, shared, retain_graph=True) for v in values]
+        J.append(torch.stack([torch.cat([g.flatten() for g in row]) for row in rows]))
+        losses.append(torch.stack(values))
+    A_KK, mean_K = (J[0] @ J[1].T).double(), (losses[0] + losses[1]).detach() / 2
+    weight_K = kind(TERMS).weights(A_KK, mean_K.double()).float()
+    assert list(weighting.weights.values()) == pytest.approx(weight_K.tolist(), rel=1e-5)
+    direction_P = weight_K @ J[2]
+    torch.testing.assert_close(torch.cat([g.flatten() for g in found[: len(shared)]]), direction_P)
+    head_K = weight_K if kind.weighted_heads else torch.ones(5)
+    expected = torch.autograd.grad((head_K * losses[2]).sum(), own)
+    for mine, other in zip(found[len(shared) :], expected, strict=True):
+        torch.testing.assert_close(mine, other)
+
+
+def test_cross_batches_in_parts_and_a_loss_scale_change_nothing():
+    class Fixed(CrossMethod):  # batch norm sees parts, so weights that depend on gradients differ
+        def weights(self, G_KK, loss_K):
+            return torch.arange(1.0, 6.0).to(loss_K)
+
+    batches = [X[:4], X[4:8], X[8:]]
+    whole, _ = cross_toy(Fixed, [[x] for x in batches])
+    for mine, other in zip(cross_toy(Fixed, [[x] for x in batches], 64.0)[0], whole, strict=True):
+        torch.testing.assert_close(mine, other)
+    twice, _ = cross_toy(Fixed, [[x, x] for x in batches])
+    for mine, other in zip(twice, whole, strict=True):
+        torch.testing.assert_close(mine, other)
+
+
+def test_independent_batches_without_a_common_loss_are_refused():
+    net, names = TinyNet(), [term.name for term in TERMS]
     with pytest.raises(ValueError, match="share no labels"):
-        backward(Last(TERMS), [[partial(net, X, names[i : i + 1])] for i in range(3)], net)
+        backward(ByCross(TERMS), [[partial(net, X, names[i : i + 1])] for i in range(3)], net)
 
 
 def test_look_ahead_sees_the_moved_point_and_leaves_it():

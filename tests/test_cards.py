@@ -136,7 +136,7 @@ def test_source_formula_and_settings(tmp_path):
         ("method.LossMethod", "x = 1", "losses", "1F + 1B", ()),
         ("LossMethod", "reevaluates = True", "losses", "2F + 1B", ("the losses after the step",)),
         ("GradientMethod", "x = 1", "gradients", "1F + K(H + T)", ()),
-        ("GradientMethod", "batches: int = 3", "gradients", "3F + 3K(H + T)", ("3 batches",)),
+        ("CrossMethod", "x = 1", "gradients", "3F + 2K(H + T) + KH + 1T", ("3 batches",)),
         ("GradientMethod", "space = 'representation'", "representation", "1F + KH + 1T", ()),
         (
             "GradientMethod",
