@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 Gradient = Sequence[Tensor | None]  # in the order of the space's tensors
-CHUNK = 2**16  # numbers of a gradient at once: those of K gradients stay in a core's cache
+CPU_CHUNK = 2**14  # numbers of a gradient at once: those of K gradients stay in a core's cache
 
 
 def products(one: Sequence[Gradient], other: Sequence[Gradient]) -> Tensor:
@@ -32,7 +32,8 @@ def _products(a_K: Gradient, b_L: Gradient) -> list[Tensor]:
     like = next(x for x in [*a_K, *b_L] if x is not None)
     flat_K, flat_L = ([None if x is None else x.reshape(-1) for x in xs] for xs in (a_K, b_L))
     found = []
-    edges = [*range(0, like.numel(), CHUNK), like.numel()]
+    chunk = CPU_CHUNK if like.device.type == "cpu" else like.numel()
+    edges = [*range(0, like.numel(), chunk), like.numel()]
     for start, end in pairwise(edges):
         A_Kp = _stack(flat_K, like, start, end)
         B_Lp = A_Kp if b_L is a_K else _stack(flat_L, like, start, end)
