@@ -2,13 +2,14 @@
 
 Made from the ground truth of the training split alone, and the same for every image: the mean depth
 of each pixel, and the class that each pixel has most often. Things become one instance a class.
+Of frames that differ in size (KITTI's, by 2 %) the nearest pixels count.
 """
 
 import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,21 @@ from scipy import ndimage
 from torch import Tensor
 
 from mtl_bench import config, postprocess
+from mtl_bench.collector import DepthScore, add_depth
+from mtl_bench.data.batch import Batch
 from mtl_bench.data.cityscapes import Cityscapes
-from mtl_bench.data.labels import CITYSCAPES20, IGNORE, LabelSet
+from mtl_bench.data.labels import IGNORE, LabelSet, labels_of
 from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.data.targets import class_of_instance_id
-from mtl_bench.evaluate import Collector, Evaluation, Prediction, Progress, true_size
+from mtl_bench.evaluate import (
+    Collector,
+    Evaluation,
+    Pass,
+    Prediction,
+    Progress,
+    open_passes,
+    true_size,
+)
 from mtl_bench.metrics.depth import evaluation_mask
 
 VERSION = 2  # raised when the predictors change
@@ -35,7 +46,6 @@ def baselines(
     cache_dir: Path,
     split: str | None = None,
     progress: Progress | None = None,
-    labels: LabelSet = CITYSCAPES20,
 ) -> Evaluation:
     """The trivial predictors' metrics, keyed as `evaluate`'s, of the cell's tasks.
 
@@ -43,9 +53,9 @@ def baselines(
     it is in metres already. Kept in `cache_dir`, one file for each data set and protocol.
     """
     cell = dataclasses.replace(cell, video=False, single_task=False)
-    split = split or cell.recipe.evaluate.split
+    labels = labels_of(cell.recipe.data.dataset)
+    main, *others = open_passes(cell, root, split)
     training = open_dataset(cell, "train", root, training=False).uncached()
-    dataset = open_dataset(cell, split, root, training=False).uncached()
     settings = {
         "version": [VERSION, config.PROTOCOL],
         "root": str(root.resolve()),
@@ -53,14 +63,17 @@ def baselines(
         "evaluate": config.to_dict(cell.recipe.evaluate),
         "labels": labels.name,
         "tasks": list(cell.tasks),
-        "frames": [split, *training.names, *dataset.names],
+        "frames": [
+            *training.names,
+            *([each.measured[0].split, *each.dataset.names] for each in (main, *others)),
+        ],
     }
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
     path = cache_dir / f"baselines-{key}.json"
     if path.is_file():
         return Evaluation(**json.loads(path.read_text()))
 
-    done, total = 0, len(training) + len(dataset)
+    done, total = 0, sum(map(len, (training, main.dataset, *(each.dataset for each in others))))
 
     def step(frames: int) -> None:
         nonlocal done
@@ -69,11 +82,23 @@ def baselines(
             progress(done, total)
 
     average = _average(training, cell, labels, step)
-    collector = Collector(cell, labels, len(dataset))
-    for batch in eval_batches(dataset, BATCH):
-        collector.update(batch, _constant(average, len(batch.names), cell, labels))
-        step(len(batch.names))
-    evaluation = collector.result(split, torch.device("cpu"))
+
+    def predictions(each: Pass) -> Iterator[tuple[Batch, Prediction]]:
+        for batch in eval_batches(each.dataset.uncached(), BATCH):
+            yield batch, _constant(average, batch, each.cell, labels)
+            step(len(batch.names))
+
+    collector = Collector(cell, labels, len(main.dataset), main.measured)
+    for batch, prediction in predictions(main):
+        collector.update(batch, prediction)
+    further: list[DepthScore] = []
+    for other in others:
+        scores = [DepthScore(protocol) for protocol in other.measured]
+        for batch, prediction in predictions(other):
+            for slot in range(len(batch.names)):
+                add_depth(scores, batch, prediction, slot)
+        further += scores
+    evaluation = collector.result(main.measured[0].split, torch.device("cpu"), further)
     evaluation.protocol |= {"engine": "none", "dgc_ground": "none: the mean depth is in metres"}
     evaluation.samples = {}
     cache_dir.mkdir(parents=True, exist_ok=True)
@@ -96,13 +121,15 @@ class Average:
         self.depth_count = np.zeros(size, np.int32)
 
     def add(self, instance_ids_HW: Tensor | None, depth_m_HW: Tensor | None) -> None:
+        size = self.depth_sum.shape
         if instance_ids_HW is not None:
-            class_HW = self.class_of_id[instance_ids_HW.numpy()]
+            class_HW = self.class_of_id[_nearest(instance_ids_HW.numpy(), size)]
             for index in np.unique(class_HW[class_HW != IGNORE]):
                 self.votes[index] += class_HW == index
         if depth_m_HW is not None:
-            valid_HW = evaluation_mask(depth_m_HW.numpy(), self.ev)
-            self.depth_sum += np.where(valid_HW, depth_m_HW.numpy(), 0)
+            depth_m = _nearest(depth_m_HW.numpy(), size)
+            valid_HW = evaluation_mask(depth_m, self.ev)
+            self.depth_sum += np.where(valid_HW, depth_m, 0)
             self.depth_count += valid_HW
 
     def class_HW(self) -> NDArray[np.uint8]:
@@ -125,18 +152,12 @@ class Average:
 def _average(
     training: Cityscapes, cell: config.Cell, labels: LabelSet, step: Callable[[int], None]
 ) -> Average:
-    """Average a split's frames, which must have one size."""
+    """Average a split's frames, at the first one's size."""
     average = None
     for batch in eval_batches(training, BATCH):
         ids = batch.instance_ids_BHW if "panoptic" in cell.tasks else None
         depth = batch.depth_m_BHW if "depth" in cell.tasks else None
-        size = true_size(batch)
-        average = average or Average(labels, cell.recipe.evaluate, size)
-        if size != average.depth_sum.shape:
-            raise ValueError(
-                f"{batch.names[0]} is {size}, frames before it {average.depth_sum.shape}: "
-                "an average image needs frames of one size"
-            )
+        average = average or Average(labels, cell.recipe.evaluate, true_size(batch))
         for slot in range(len(batch.names)):
             average.add(None if ids is None else ids[slot], None if depth is None else depth[slot])
         step(len(batch.names))
@@ -145,11 +166,24 @@ def _average(
     return average
 
 
-def _constant(average: Average, count: int, cell: config.Cell, labels: LabelSet) -> Prediction:
-    """The same prediction for `count` frames, through the same post-processing as a network's."""
+def _nearest(array_HW: NDArray, size: tuple[int, ...]) -> NDArray:
+    """At another size: of each pixel the one that its middle falls on."""
+    if array_HW.shape == size:
+        return array_HW
+    rows, columns = (
+        ((np.arange(new) + 0.5) * old / new).astype(int)
+        for new, old in zip(size, array_HW.shape, strict=True)
+    )
+    return array_HW[np.ix_(rows, columns)]
+
+
+def _constant(average: Average, batch: Batch, cell: config.Cell, labels: LabelSet) -> Prediction:
+    """The same prediction for every frame, through the same post-processing as a network's."""
+    count, size = len(batch.names), true_size(batch)
     prediction = Prediction()
     if "panoptic" in cell.tasks:
-        class_BHW = torch.from_numpy(average.class_HW()).long().expand(count, -1, -1)
+        class_HW = _nearest(average.class_HW(), size)
+        class_BHW = torch.from_numpy(class_HW).long().expand(count, -1, -1)
         nothing_B2HW = torch.zeros(count, 2, *class_BHW.shape[1:])
         panoptic_BHW = postprocess.panoptic(
             class_BHW, nothing_B2HW[:, :1], nothing_B2HW, labels.things, cell.recipe.evaluate
@@ -157,7 +191,7 @@ def _constant(average: Average, count: int, cell: config.Cell, labels: LabelSet)
         prediction.class_BHW = class_BHW
         prediction.instance_ids_BHW = postprocess.to_instance_ids(panoptic_BHW, labels)
     if "depth" in cell.tasks:
-        depth_m_HW = torch.from_numpy(average.depth_m_HW())
+        depth_m_HW = torch.from_numpy(_nearest(average.depth_m_HW(), size))
         prediction.depth_B1HW = depth_m_HW.expand(count, 1, -1, -1)
         prediction.dgc_scale_B = torch.ones(count)
         prediction.dgc_source_B = torch.full((count,), postprocess.ROAD)

@@ -38,7 +38,13 @@ TASKS = ("panoptic", "depth")
 GRANULARITIES = ("terms", "tasks")
 # Values that recipes have had since protocol 2 began. One that is its default is left out of the
 # canonical JSON, so that cells which were run before keep their ids.
-LATER: tuple[tuple[str, str], ...] = ()  # section, key
+LATER: tuple[tuple[str, str], ...] = (  # section, key
+    ("data", "train_frames"),
+    ("data", "test_scenes"),
+    ("evaluate", "protocol"),
+    ("evaluate", "also"),
+    ("evaluate", "flip"),
+)
 
 
 @dataclass(frozen=True)

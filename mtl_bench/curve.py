@@ -62,3 +62,11 @@ def training_time(path: Path) -> tuple[float, float]:
     with path.open(newline="") as file:
         step_ms = [float(row["step_ms"]) for row in csv.DictReader(file)]
     return sum(step_ms) / 1000, statistics.median(step_ms)
+
+
+def data_share(path: Path) -> float:
+    """Share of all steps' time in which training waited for batches."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    waited, took = (sum(float(row[key]) for row in rows) for key in ("data_ms", "step_ms"))
+    return waited / took

@@ -42,6 +42,11 @@ class Engine:
         """The faster memory layout for convolutions on CUDA; slower here on the CPU."""
         return self.device.type == "cuda"
 
+    @property
+    def pinned(self) -> bool:
+        """Whether batches should wait in page-locked memory: CUDA then copies beside the CPU."""
+        return self.device.type == "cuda"
+
     def place(self, model: nn.Module) -> nn.Module:
         layout = torch.channels_last if self.channels_last else torch.contiguous_format
         return model.to(self.device, memory_format=layout)  # type: ignore[call-overload]

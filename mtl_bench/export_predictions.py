@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from mtl_bench import config
-from mtl_bench.data.labels import CITYSCAPES20, LabelSet
+from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.data.targets import DIVISOR
 from mtl_bench.evaluate import Progress, evaluating, predict, true_size
@@ -32,7 +32,6 @@ def export_predictions(
     split: str | None = None,
     batch_size: int = 8,
     progress: Progress | None = None,
-    labels: LabelSet = CITYSCAPES20,
 ) -> Path:
     """Predict a split (None: the recipe's) and write it; returns the JSON file.
 
@@ -43,6 +42,7 @@ def export_predictions(
         raise ValueError(f"cell {cell.slug} has no panoptic task: nothing to export")
     split = split or cell.recipe.evaluate.split
     dataset = open_dataset(cell, split, root, training=False)
+    labels = labels_of(cell.recipe.data.dataset)
 
     def frames() -> Iterable[tuple[str, NDArray]]:
         done = 0

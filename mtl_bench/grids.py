@@ -33,34 +33,25 @@
 `method` and `backbone` stand in the axes or in every row; a file without [[row]] is the axes alone.
 Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, recipe,
 recipe.SECTION.KEY, method.KEY, backbone.KEY. Under [baseline] a cell keeps recipe, backbone and
-seed, and nothing else of its own. A wrong key is told with its line.
+seed, and nothing else of its own. A wrong key is told with its line. A file with kind = "latency"
+is of another form: see `latency_grid.py`.
 """
 
 import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from mtl_bench import plugins, toml_file
-from mtl_bench.config import (
-    TASKS,
-    Cell,
-    Recipe,
-    did_you_mean,
-    load_recipe,
-    override,
-    set_values,
-    to_dict,
-)
+from mtl_bench import grid_file
+from mtl_bench.config import TASKS, Cell, Recipe, load_recipe, override, set_values, to_dict
+from mtl_bench.grid_file import GRIDS, grid_names, question_of
 from mtl_bench.toml_file import Place, TomlFile
 
-GRIDS = Path(__file__).parent / "grids"
-KEYS = {"question": str, "recipe": str, "axes": dict, "row": list, "skip": list}
-KEYS |= {"baseline": dict, "report": dict}
-FORMS = {str: '{} = "text"', dict: "[{}], a section", list: "[[{}]], two brackets on each side"}
+__all__ = ["GRIDS", "Grid", "Skip", "baseline_cell", "grid_names", "load_grid", "question_of"]
+__all__ += ["with_parents"]
+
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
 
@@ -84,15 +75,6 @@ class Grid:
     report: Mapping[str, Any] = field(default_factory=lambda: NOTHING)
     names: Mapping[str, str] = field(default_factory=lambda: NOTHING)  # cell id -> its row's
     baseline: Mapping[str, Any] = field(default_factory=lambda: NOTHING)  # see baseline_cell
-
-
-def grid_names() -> list[str]:
-    return sorted(path.stem for path in GRIDS.glob("*.toml"))
-
-
-def question_of(name: str) -> str:
-    """What a grid asks, without expanding it."""
-    return str(_read(name).values.get("question", ""))
 
 
 def with_parents(cells: Iterable[Cell]) -> tuple[Cell, ...]:
@@ -126,7 +108,7 @@ def load_grid(
     Args:
         recipe: in place of the grid's.
         seeds: seeds 0 .. seeds - 1 in place of the grid's.
-        smoke: the recipe `smoke`, under a name that says so.
+        smoke: the grid's `smoke_recipe` (without one: `smoke`), under a name that says so.
         settings: `key=value` for every cell; stands in place of an axis or of a row's value, and is
             what a row's "2x" multiplies.
         pretrained: as in `Cell`, for every cell.
@@ -134,8 +116,10 @@ def load_grid(
     Raises:
         ValueError: no such grid, or a key or value that it cannot have, with file and line.
     """
-    file = _read(name)
-    axes = _axes(file)
+    file = grid_file.read(name)
+    if grid_file.kind_of(file) != grid_file.TRAINING:
+        raise ValueError(f"grid '{name}' times networks: it has no cells to train")
+    axes = grid_file.axes(file)
     if seeds is not None:
         if seeds < 1:
             raise ValueError(f"{seeds} seeds: at least 1 is needed")
@@ -146,7 +130,8 @@ def load_grid(
     axes = {axis: values for axis, values in axes.items() if axis not in given}
     for row in rows if "recipe" in given else ():
         row.pop("recipe", None)
-    chosen = "smoke" if smoke else recipe or str(file.values.get("recipe", "small"))
+    key, otherwise = ("smoke_recipe", "smoke") if smoke else ("recipe", "small")
+    chosen = (not smoke and recipe) or str(file.values.get(key, otherwise))
     start = Cell(load_recipe(chosen), "", "", pretrained=pretrained)
     cells, skips, names = _expand(file, start, axes, rows, settings)
     baseline = file.values.get("baseline", {})
@@ -165,35 +150,6 @@ def load_grid(
 
 
 # --- the file -------------------------------------------------------------------------------------
-
-
-def _read(name: str) -> TomlFile:
-    """Find and read a grid file; its keys are known ones and of the right form."""
-    path = Path(name) if name.endswith(".toml") else GRIDS / f"{name}.toml"
-    if not path.is_file():
-        hint = "" if name.endswith(".toml") else did_you_mean(name, grid_names())
-        raise ValueError(f"no grid called '{name}'{hint}; a file of your own: --grid PATH.toml")
-    file = toml_file.read(path)
-    for key, value in file.values.items():
-        wrong = f"unknown key '{key}'{did_you_mean(key, KEYS)}" if key not in KEYS else ""
-        if not wrong and not isinstance(value, KEYS[key]):
-            wrong = f"write it as {FORMS[KEYS[key]].format(key)}"
-        if wrong:
-            raise file.error(wrong, key, ("", 0), (key, 0))
-    file.refuse_sections_in("axes", "row", "skip", "baseline")
-    return file
-
-
-def _axes(file: TomlFile) -> dict[str, tuple[Any, ...]]:
-    found: dict[str, tuple[Any, ...]] = {}
-    for axis, values in file.values.get("axes", {}).items():
-        if values == "all" and f"{axis}s" in plugins.KINDS:
-            values = list(plugins.files(f"{axis}s"))
-        if not isinstance(values, list) or not values:
-            message = f"axis '{axis}' is a list of values, not {values!r}"
-            raise file.error(message, axis, ("axes", 0))
-        found[axis] = tuple(values)
-    return found
 
 
 def _rows(file: TomlFile, axes: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -1,11 +1,9 @@
 """The video stage's labels: what a trained model predicts on frames that no human labelled.
 
 Naive-Student's idea (Chen et al., ECCV 2020) as MGNet uses it: predictions averaged over scales and
-mirror images, grouped into instances, written in Cityscapes' format:
-
-    <out>/pseudo_labels.json                                    what made them
-    <out>/gtFine/<split>/<city>/<name>_gtFine_labelIds.png      8 bits
-    <out>/gtFine/<split>/<city>/<name>_gtFine_instanceIds.png   16 bits, written last: frame done
+mirror images, grouped into instances, written in Cityscapes' format (`pseudo_frames`) with a record
+of what made them, `<out>/pseudo_labels.json`. For KITTI, which has no human labels, a model trained
+on Cityscapes labels the training frames.
 
 Departures from MGNet's public code: small stuff segments stay (a small pole is still a pole), and
 human labels are neither copied nor touched. Shapes: B frames, C classes, H x W pixels.
@@ -13,7 +11,6 @@ human labels are neither copied nor touched. Shapes: B frames, C classes, H x W 
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -27,20 +24,19 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mtl_bench import config, postprocess
-from mtl_bench.data import cityscapes_files as files
-from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, Kind
-from mtl_bench.data.labels import CITYSCAPES20, IGNORE, LabelSet
+from mtl_bench.data.cityscapes_files import read_image
+from mtl_bench.data.kitti import to_size
+from mtl_bench.data.kitti_files import RECORD
+from mtl_bench.data.labels import IGNORE, LabelSet, labels_of
+from mtl_bench.data.layouts import KITTI, layout_of
 from mtl_bench.data.targets import DIVISOR
 from mtl_bench.evaluate import Progress, evaluating
 from mtl_bench.model import Model, Outputs
 from mtl_bench.plain import to_dict
+from mtl_bench.pseudo_frames import Frames, Size, frames_of, write
 
-RECORD = "pseudo_labels.json"
-LABEL_IDS = Kind("gtFine", "_gtFine_labelIds.png", "label map", 8)
 PIXELS = 2**18  # of the input images that go through the network at once; one frame at least
 GROUPING = ("center_threshold", "nms_kernel", "top_k")  # what of config.Evaluate labels depend on
-
-Size = tuple[int, int]  # height, width
 
 
 class Maps(NamedTuple):
@@ -55,56 +51,54 @@ def ensure(
     model: Model,
     cell: config.Cell,
     root: Path,
-    out: Path,
+    out: Path | None,
     device: torch.device,
     progress: Progress | None = None,
     split: str = "train",
-    labels: LabelSet = CITYSCAPES20,
 ) -> Path:
-    """Label every frame of the sequences that has both neighbours and no human label.
+    """Label a split's frames: in Cityscapes' layout those of the sequences that have both
+    neighbours and no human label.
 
     Stopped and called again it goes on, and on the CPU ends with the same bytes.
 
     Args:
         cell: `recipe.pseudo` says how to predict, `recipe.evaluate` how to group pixels.
-        out: a new or empty folder, or one that such a call began.
+        out: a new or empty folder, or one that such a call began; None: KITTI's own.
         progress: told how many frames have labels, at the start and after each.
 
     Returns:
-        The folder that `open_dataset` takes as `sequence_labels`.
+        Of Cityscapes, the folder that `open_dataset` takes as `sequence_labels`; of KITTI, `out`.
 
     Raises:
         ValueError: a cell without the panoptic task, options without meaning, no frame to label,
             an `out` with human labels or labels of another making, a prediction that is not finite.
     """
-    _check(cell)
-    source, folder = root / SEQUENCE.folder / split, out / LABELS.folder / split
-    names = files.unlabelled_names(root, split)
-    if not names:
-        raise ValueError(
-            f"{source}: no frame without a human label that has both neighbours; unpack "
-            f"{SEQUENCE.package}, or render the built-in scenes with recipe.data.frames=4 or more"
-        )
-    if folder.resolve().is_relative_to((root / LABELS.folder).resolve()):
-        raise ValueError(f"{out}: the data set's own labels belong there; choose another --out")
-    _claim_folder(out, _record(model, cell, source, labels))
+    _check(cell, root)
+    labels = labels_of(cell.recipe.data.dataset)
+    frames = frames_of(root, out, split, cell.recipe)
+    _claim_folder(frames, _record(model, cell, frames, labels))
 
-    done = files.names_in(folder, LABELS).intersection(names)
+    done = frames.done()
     count = len(done)
     if progress:
-        progress(count, len(names))
+        progress(count, len(frames.names))
     with evaluating(model), torch.inference_mode():
-        for name, maps in _predictions(model, cell, source, names, done, device):
-            _write_frame(folder, name, instance_ids(maps, cell, labels)[0])
+        for name, maps in _predictions(model, cell, frames, done, device):
+            frames.write(name, instance_ids(maps, cell, labels)[0])
             count += 1
             if progress:
-                progress(count, len(names))
-    return folder
+                progress(count, len(frames.names))
+    return frames.folder
 
 
-def _check(cell: config.Cell) -> None:
+def _check(cell: config.Cell, root: Path) -> None:
     if "panoptic" not in cell.tasks:
         raise ValueError(f"cell {cell.slug} has no panoptic task: it cannot make pseudo labels")
+    if cell.video and layout_of(root) == KITTI:
+        raise ValueError(
+            "video is for Cityscapes' sequences: KITTI's labels are pseudo labels already; "
+            "set video=false"
+        )
     options = cell.recipe.pseudo
     if not options.scales or min(options.scales) <= 0:
         raise ValueError(f"pseudo.scales must be positive numbers, not {list(options.scales)}")
@@ -115,14 +109,15 @@ def _check(cell: config.Cell) -> None:
 # --- prediction -----------------------------------------------------------------------------------
 
 
-def pass_sizes(recipe: config.Recipe) -> list[Size]:
-    """Input sizes of the passes: the recipe's, scaled, to the nearest that the network divides."""
+def pass_sizes(recipe: config.Recipe, size: Size | None = None) -> list[Size]:
+    """Input sizes of the passes: the recipe's (or another), scaled, to the nearest that the network
+    divides."""
     stride = recipe.network.strides[-1]
 
     def scaled(length: int, scale: float) -> int:
         return max(round(length * scale / stride), 1) * stride
 
-    height, width = recipe.data.height, recipe.data.width
+    height, width = size or (recipe.data.height, recipe.data.width)
     return [(scaled(height, scale), scaled(width, scale)) for scale in recipe.pseudo.scales]
 
 
@@ -191,8 +186,7 @@ def instance_ids(maps: Maps, cell: config.Cell, labels: LabelSet) -> NDArray[np.
 def _predictions(
     model: Model,
     cell: config.Cell,
-    source: Path,
-    names: list[str],
+    frames: Frames,
     done: set[str],
     device: torch.device,
 ) -> Iterator[tuple[str, Maps]]:
@@ -201,16 +195,19 @@ def _predictions(
     Batches are cut from all the frames, not from those that are left: a frame's last bits may
     depend on its batch.
     """
-    data = cell.recipe.data
-    batch_size = max(1, PIXELS // (data.height * data.width))
-    for start in range(0, len(names), batch_size):
-        batch = names[start : start + batch_size]
+    flip = cell.recipe.pseudo.flip
+    batches = (
+        (group.names[start : start + count], group.size)
+        for group in frames.groups()
+        for count in [max(1, PIXELS // (group.size[0] * group.size[1]))]
+        for start in range(0, len(group.names), count)
+    )
+    for batch, size in batches:
         if done.issuperset(batch):
             continue
-        images = [files.read_image(files.file_of(source, SEQUENCE, name)) for name in batch]
-        image_B3HW = torch.stack([_to_input(image, data) for image in images]).to(device)
-        sizes, flip = pass_sizes(cell.recipe), cell.recipe.pseudo.flip
-        maps = average(model.net, image_B3HW.float() / 255, sizes, flip)
+        images = [read_image(frames.image(name)) for name in batch]
+        image_B3HW = torch.stack([_to_input(image, size) for image in images]).to(device)
+        maps = average(model.net, image_B3HW.float() / 255, pass_sizes(cell.recipe, size), flip)
         if not all(x.isfinite().all() for x in maps):
             raise ValueError(f"the prediction is not finite in a frame of {batch}")
         for slot, (name, image) in enumerate(zip(batch, images, strict=True)):
@@ -218,44 +215,41 @@ def _predictions(
                 yield name, _resized(Maps(*(x[slot : slot + 1] for x in maps)), image.shape[:2])
 
 
-def _to_input(image_HW3: NDArray[np.uint8], data: config.Data) -> Tensor:
-    """[3,H,W] at the recipe's size, as the reader shrinks frames."""
-    if image_HW3.shape[:2] != (data.height, data.width):
-        image_HW3 = cv2.resize(image_HW3, (data.width, data.height), interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(image_HW3).permute(2, 0, 1)
+def _to_input(image_HW3: NDArray[np.uint8], size: Size) -> Tensor:
+    """[3,H,W] at the input's size, as the reader resizes frames."""
+    return torch.from_numpy(to_size(image_HW3, *size, cv2.INTER_AREA)).permute(2, 0, 1)
 
 
 # --- files ----------------------------------------------------------------------------------------
 
 
-def _record(model: nn.Module, cell: config.Cell, source: Path, labels: LabelSet) -> dict[str, Any]:
+def _record(
+    model: nn.Module, cell: config.Cell, frames: Frames, labels: LabelSet
+) -> dict[str, Any]:
     """What the labels depend on; no paths, as folders move."""
     recipe = cell.recipe
     weights = hashlib.sha256()
     for name, tensor in sorted(model.state_dict().items()):
         weights.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
         weights.update(tensor.cpu().contiguous().flatten().view(torch.uint8).numpy())
-    first = files.file_of(source, SEQUENCE, min(files.names_in(source, SEQUENCE)))
+    record = {"protocol": config.PROTOCOL, "weights": weights.hexdigest(), "labels": labels.name}
+    record |= frames.record()
+    if isinstance(record["input"], list):
+        record["passes"] = [list(size) for size in pass_sizes(recipe, tuple(record["input"]))]
     return {
-        "protocol": config.PROTOCOL,
-        "weights": weights.hexdigest(),
-        "labels": labels.name,
-        "split": source.name,
-        "first frame": hashlib.sha256(first.read_bytes()).hexdigest(),  # tells data sets apart
-        "input": [recipe.data.height, recipe.data.width],
-        "passes": [list(size) for size in pass_sizes(recipe)],
+        **record,
         **to_dict(recipe.pseudo),
         **{key: getattr(recipe.evaluate, key) for key in GROUPING},
     }
 
 
-def _claim_folder(out: Path, record: dict[str, Any]) -> None:
+def _claim_folder(frames: Frames, record: dict[str, Any]) -> None:
     """Write the record into a fresh folder, or compare with the one that is there.
 
     Raises:
         ValueError: labels of another or of unknown making are there.
     """
-    path = out / RECORD
+    out, path = frames.out, frames.out / RECORD
     if path.is_file():
         try:
             there = json.loads(path.read_text())
@@ -268,24 +262,7 @@ def _claim_folder(out: Path, record: dict[str, Any]) -> None:
                 f"another --out, or delete that folder"
             )
         return
-    unknown = next(out.rglob("*_gtFine_*"), None)
+    unknown = frames.stranger()
     if unknown:
         raise ValueError(f"{unknown} is not of this command's making; choose another --out")
-    _write(path, json.dumps(record, indent=1).encode() + b"\n")
-
-
-def _write_frame(folder: Path, name: str, ids_HW: NDArray[np.uint16]) -> None:
-    label_HW = np.where(ids_HW < DIVISOR, ids_HW, ids_HW // DIVISOR).astype(np.uint8)
-    for kind, array in ((LABEL_IDS, label_HW), (LABELS, ids_HW)):
-        _write(files.file_of(folder, kind, name), cv2.imencode(".png", array)[1].tobytes())
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    write(path, json.dumps(record, indent=1).encode() + b"\n")

@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Data:
-    """The images. "synthetic" is rendered on first use; any other data set is found by --data."""
+    """The images. "synthetic..." is rendered on first use; any other is found by --data."""
 
-    dataset: str = "synthetic"  # synthetic | cityscapes
+    dataset: str = "synthetic"  # synthetic | cityscapes | synthetic-kitti | kitti
     height: int = 64  # network input, pixels; synthetic scenes are rendered at this size
     width: int = 128
     train_scenes: int = 800  # synthetic only
     val_scenes: int = 100  # synthetic only
+    test_scenes: int = 8  # synthetic only
     frames: int = 3  # synthetic only: length of a snippet; the video stage needs 4 or more
     seed: int = 0  # synthetic only: which world
+    train_frames: str = "published"  # KITTI only: published (the split's) | all (with neighbours)
     cache: bool = True  # keep decoded frames in memory
     workers: int = 0  # data-loading processes; 0 = in the training process
 
@@ -102,7 +104,10 @@ class Evaluate:
     stuff_area: int = 2048  # pixels; smaller stuff segments become void
     min_depth_m: float = 0.001
     max_depth_m: float = 80.0
-    depth_crop: str = "none"  # none | garg
+    depth_crop: str = "none"  # none: the protocol's | garg | manydepth
+    protocol: str = "full-frame"  # of the depth metrics; names in `mtl_bench/protocols.py`
+    also: tuple[str, ...] = ()  # further protocols; their metrics' keys begin with their names
+    flip: bool = False  # inverse depth averaged with that of the mirrored image
 
 
 @dataclass(frozen=True)

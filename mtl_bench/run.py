@@ -14,13 +14,15 @@ import torch
 
 from mtl_bench import provenance, pseudo_labels, results
 from mtl_bench.config import Cell, to_dict
-from mtl_bench.curve import training_time
+from mtl_bench.curve import data_share, training_time
+from mtl_bench.data.kitti import Kitti
+from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.engine import Engine, choose_device
-from mtl_bench.evaluate import evaluate
+from mtl_bench.evaluate import evaluate, open_passes
 from mtl_bench.model import Model
 from mtl_bench.progress import Interrupted, Progress
-from mtl_bench.stored import LABELS, load_model, time_cell
+from mtl_bench.stored import load_model, time_cell
 from mtl_bench.tracking import Tracker
 from mtl_bench.train import CHECKPOINT, train
 
@@ -32,7 +34,7 @@ class Trained:
     """A cell's model, and what it took to get it."""
 
     model: Model
-    time: dict[str, float]  # train_s, step_ms, peak_mib; of a video cell also pseudo_s
+    time: dict[str, float]  # train_s, step_ms, data_share, peak_mib; of a video cell also pseudo_s
     protocol: dict[str, Any]
 
 
@@ -55,7 +57,8 @@ def run_cell(
         The row, as `row.json` has it.
 
     Raises:
-        ValueError: a parent of the cell has no result or no checkpoint.
+        ValueError: a parent of the cell has no result or no checkpoint, or the data set lacks what
+            its evaluation needs.
     """
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
     progress = Progress(run_dir, echo)
@@ -64,6 +67,7 @@ def run_cell(
     environment = provenance.environment(engine.device)
     results.write_json(run_dir / "env.json", environment)
 
+    open_passes(cell, root)  # what would stop the evaluation is told before the training
     if cell.single_task:
         trained = _trained_apart(cell, run_dir, engine)
     else:
@@ -105,20 +109,24 @@ def _train(
 ) -> Trained:
     """Train; a video cell goes on from its parent's checkpoint, with labels that this one made."""
     taken: dict[str, Any] = results.read_json(run_dir / TAKEN) or {}
-    start = labels = None
+    start = sequence_labels = None
     protocol = {}
     if cell.video:
         _, start = _result_of(cell.parents[0], run_dir.parent)
-        labels, frames = _pseudo_labels(cell, start, root, run_dir, engine, progress, taken)
+        sequence_labels, frames = _pseudo_labels(
+            cell, start, root, run_dir, engine, progress, taken
+        )
         protocol = {"pseudo_frames": frames}
     if engine.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(engine.device)
-    given = (cell, LABELS, root, run_dir, engine, progress, tracker)
-    model = train(*given, start=start, sequence_labels=labels)
+    labels = labels_of(cell.recipe.data.dataset)
+    given = (cell, labels, root, run_dir, engine, progress, tracker)
+    model = train(*given, start=start, sequence_labels=sequence_labels)
     taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(engine.device))
     results.write_json(run_dir / TAKEN, taken)
     train_s, step_ms = training_time(run_dir / "curve.csv")
-    return Trained(model, {"train_s": train_s, "step_ms": step_ms, **taken}, protocol)
+    waited = {"data_share": data_share(run_dir / "curve.csv")}
+    return Trained(model, {"train_s": train_s, "step_ms": step_ms, **waited, **taken}, protocol)
 
 
 def _pseudo_labels(
@@ -183,10 +191,14 @@ def _peak_mib(device: torch.device) -> float:
 
 
 def _training_protocol(cell: Cell, root: Path) -> dict[str, Any]:
-    """What kept the sky and the ego vehicle out of the photometric loss."""
-    if "depth" not in cell.tasks:
-        return {}
-    return {"reprojection_mask": open_dataset(cell, "train", root, training=True).reprojection_mask}
+    """What kept the sky and the ego vehicle out of the photometric loss; KITTI's frames."""
+    dataset = open_dataset(cell, "train", root, training=True)
+    protocol: dict[str, Any] = {}
+    if isinstance(dataset, Kitti):
+        protocol["training"] = dataset.described
+    if "depth" in cell.tasks:
+        protocol["reprojection_mask"] = dataset.reprojection_mask
+    return protocol
 
 
 def _identity(cell: Cell) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import torch
 
 from mtl_bench import checkpoint, provenance, results
 from mtl_bench.config import Cell
-from mtl_bench.data.labels import CITYSCAPES20, LabelSet
+from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.engine import Engine, choose_device
 from mtl_bench.evaluate import Evaluation, evaluate
@@ -19,8 +19,6 @@ from mtl_bench.latency import measure
 from mtl_bench.model import Model, side_by_side
 from mtl_bench.quiet import SIDE_BY_SIDE, Quiet
 from mtl_bench.train import CHECKPOINT, build
-
-LABELS = CITYSCAPES20
 
 
 def reevaluate(
@@ -43,7 +41,7 @@ def reevaluate(
     return evaluate(model, cell, root, engine.device, split)
 
 
-def load_model(cell: Cell, path: Path, engine: Engine, labels: LabelSet = LABELS) -> Model:
+def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
     """A cell's model with the weights of a checkpoint.
 
     Args:
@@ -56,9 +54,9 @@ def load_model(cell: Cell, path: Path, engine: Engine, labels: LabelSet = LABELS
     if cell.single_task:
         paths = [path.parent.parent / parent.slug / CHECKPOINT for parent in cell.parents]
         pairs = zip(cell.parents, paths, strict=True)
-        return side_by_side([load_model(parent, file, engine, labels) for parent, file in pairs])
+        return side_by_side([load_model(parent, file, engine) for parent, file in pairs])
     state = checkpoint.read(path)
-    model = build(cell, labels, engine)[0]
+    model = build(cell, labels_of(cell.recipe.data.dataset), engine)[0]
     try:
         model.load_state_dict(state["model"])
     except RuntimeError as error:
@@ -87,7 +85,7 @@ def time_cell(
             (sample.image_B3HW for sample in samples),
             samples[0].K_B33,
             float(samples[0].camera_height_m_B),
-            LABELS.things,
+            labels_of(recipe.data.dataset).things,
             recipe.evaluate,
             recipe.latency,
             engine.device,

@@ -68,7 +68,8 @@ def train(
     dataset = open_dataset(cell, "train", root, training=True, sequence_labels=sequence_labels)
     loss = replace(cell.recipe.loss, automask=cell.recipe.loss.automask or dataset.needs_automask)
     data_seed, first = seed_for(cell.seed, "data"), step * method.batches
-    batches = train_batches(dataset, optim.batch, data_seed, first, cell.recipe.data.workers)
+    workers = cell.recipe.data.workers
+    batches = train_batches(dataset, optim.batch, data_seed, first, workers, engine.pinned)
     clipped: list[Tensor] = list(model.parameters())
     model.train()
 
@@ -91,6 +92,7 @@ def train(
             step_start = time.perf_counter()
             lr_factor = set_learning_rate(optimizer, optim, step)
             drawn = [next(batches) for _ in range(method.batches)]
+            data_ms = 1000 * (time.perf_counter() - step_start)
             parts = [
                 [partial(forward, part.to(engine.device, engine.channels_last)) for part in split]
                 for split in (batch.split(optim.micro_batch or optim.batch) for batch in drawn)
@@ -113,6 +115,7 @@ def train(
 
             row = describe_step(weighting, method, cell)
             row |= {"update_norm": update_norm, "grad_norm": grad_norm, "lr_factor": lr_factor}
+            row["data_ms"] = data_ms  # the step's share that waited for its batches
             row["step_ms"] = 1000 * (time.perf_counter() - step_start)
             curve.append({"step": step, **row})
             tracker.log({key: value for key, value in row.items() if value is not None}, step)

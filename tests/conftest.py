@@ -1,6 +1,7 @@
 """What several test files share: a small rendered data set and the smoke recipe's cell."""
 
 import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,16 @@ os.environ["HF_HUB_OFFLINE"] = "1"  # nothing may be downloaded in a test
 from mtl_bench.config import Cell, load_recipe
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"  # real samples; not in a public clone
+
+
+@pytest.fixture(autouse=True)
+def own_signal_handlers():
+    """A cell that runs inside a test takes signals; the next test gets its own again."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, handlers, strict=True):
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

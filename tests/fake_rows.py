@@ -89,18 +89,20 @@ def write_runs(root: Path, rows, learned=True) -> Path:
     ids = np.full((2, 16, 32), 7, np.int32)
     ids[:, 4:9, 5:15], ids[:, 4:9, 16:25], ids[:, :3] = 26001, 26002, 23
     depth = np.linspace(2, 60, 16 * 32).reshape(16, 32)[None].repeat(2, 0).astype(np.float16)
-    image = rng.integers(0, 255, (2, 16, 32, 3), dtype=np.uint8)
+    image = rng.integers(0, 255, (2, 4, 8, 3), dtype=np.uint8).repeat(4, 1).repeat(4, 2)
     for row in rows:
         folder = root / row["slug"]
         folder.mkdir(parents=True)
         pd.DataFrame(curve(learned)).to_csv(folder / "curve.csv", index=False)
-        np.savez_compressed(
-            folder / "samples.npz",
-            names=np.array(["a", "b"]),
-            image=image,
-            instance_ids=np.roll(ids, 1, 2),
-            true_instance_ids=ids,
-            depth_m=depth,
-            true_depth_m=depth,
-        )
+        kept = {
+            "names": np.array(["a", "b"]),
+            "image": image,
+            "instance_ids": np.roll(ids, 1, 2),
+            "true_instance_ids": ids,
+            "depth_m": depth,
+            "true_depth_m": depth,
+        }
+        outermost = {f"extremes.{key}": value for key, value in kept.items()}
+        path = folder / "samples.npz"
+        np.savez_compressed(path, **kept, **outermost, **{"extremes.pq": [12.34, 87.65]})
     return root

@@ -1,5 +1,10 @@
 import pytest
 import torch
+from kornia.enhance import (
+    adjust_brightness_accumulative,
+    adjust_contrast_with_mean_subtraction,
+    adjust_saturation_with_gray_subtraction,
+)
 
 from mtl_bench import config
 from mtl_bench.data import augment as A
@@ -212,3 +217,57 @@ def test_flip_happens_half_of_the_time_and_everything_is_a_function_of_the_gener
     )
     assert torch.equal(one.jittered_N3HW, two.jittered_N3HW)
     assert torch.equal(one.instance_ids_HW, two.instance_ids_HW)
+
+
+# --- shortcuts, which must not change a bit -------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(24, 40), (64, 96)])
+@pytest.mark.parametrize("factor", [0.4, 0.6875, 1.0, 1.37, 2.0])
+def test_a_window_of_a_resized_frame_is_that_part_of_it(size, factor):
+    picture, labels = frames(*size), ids(*size)
+    whole, K, whole_labels = A.resize(picture, camera(), labels, factor)
+    height, width = whole.shape[-2:]
+    channels_last = [frame.permute(1, 2, 0).contiguous().permute(2, 0, 1) for frame in picture]
+    for top in (0, height // 3, height - 7):
+        for left in (0, width // 2, width - 9):
+            window = (slice(top, top + 7), slice(left, left + 9))
+            for given in (picture, channels_last):
+                part, part_K, part_labels = A.resize(given, camera(), labels, factor, window)
+                assert torch.equal(part, whole[..., window[0], window[1]])
+                assert torch.equal(part_labels, whole_labels[window])
+                assert torch.equal(part_K, A.shift(K, -left, -top))
+
+
+def test_jitter_in_blocks_is_jitter_of_the_whole(monkeypatch):
+    picture = frames(30, 50).float() / 255
+    threads = torch.get_num_threads()
+    try:
+        for seed in range(24):
+            results = []
+            for count, block in ((1, 50), (1, 7 * 50), (1, 2**16), (2, 50)):
+                torch.set_num_threads(count)
+                monkeypatch.setattr(A, "_BLOCK", block)
+                results.append(A.jitter(picture, config.Augment(), generator(seed)))
+            assert all(torch.equal(results[0], other) for other in results[1:])
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_jitter_is_kornias_changes_one_after_another():
+    picture, settings = frames().float() / 255, config.Augment(contrast=0.5)
+    widths = (settings.brightness, settings.contrast, settings.saturation, settings.hue)
+    for seed in range(12):
+        source = generator(seed)
+        draws = (torch.rand(4, generator=source) * 2 - 1).tolist()
+        expected = picture.transpose(0, 1).flatten(1, 2)
+        for kind in torch.randperm(4, generator=source).tolist():
+            factor = 1 + widths[kind] * draws[kind]
+            expected = (
+                adjust_brightness_accumulative,
+                adjust_contrast_with_mean_subtraction,
+                adjust_saturation_with_gray_subtraction,
+                A._turn_hue,
+            )[kind](expected, factor)
+        expected = expected.unflatten(1, (3, -1)).transpose(0, 1)
+        torch.testing.assert_close(A.jitter(picture, settings, generator(seed)), expected)

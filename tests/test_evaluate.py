@@ -170,11 +170,33 @@ def test_samples_are_spread_over_the_split(root):
     np.testing.assert_allclose(samples["depth_m"][valid], samples["true_depth_m"][valid], rtol=1e-2)
 
 
+def test_the_worst_and_the_best_frame_are_kept(root):
+    numbers = iter(range(FRAMES))
+
+    def spoiled(outputs):
+        """Sky all over frame 3, and in the upper half of frame 1."""
+        for semantic in outputs.semantic_BCHW:
+            rows = {1: HEIGHT // 2, 3: HEIGHT}.get(next(numbers), 0)
+            semantic[:, :rows] = 0
+            semantic[CITYSCAPES20.index("sky"), :rows] = 9
+        return outputs
+
+    samples = run(CELL, root, change=spoiled).samples
+    worst, best = samples["extremes.names"]
+    assert worst == "aachen_000003_000019"
+    assert best not in (worst, "aachen_000001_000019")
+    assert 0 < samples["extremes.pq"][0] < samples["extremes.pq"][1] == 100.0
+    assert samples["extremes.image"][0, 0, 0, 0] == 3
+    for key in ("instance_ids", "true_instance_ids", "depth_m", "true_depth_m"):
+        assert samples[f"extremes.{key}"].shape == (2, HEIGHT, WIDTH)
+
+
 def test_one_task_has_no_numbers_of_the_other(root):
     panoptic = run(replace(CELL, tasks=("panoptic",)), root)
     assert panoptic.metrics["panoptic.pq"] == 100.0
     assert not [key for key in panoptic.metrics if key.startswith(("depth", "dgc"))]
-    assert set(panoptic.samples) == {"names", "image", "instance_ids", "true_instance_ids"}
+    kept = {"names", "image", "instance_ids", "true_instance_ids"}
+    assert set(panoptic.samples) == kept | {f"extremes.{key}" for key in (*kept, "pq")}
 
     depth = run(replace(CELL, tasks=("depth",)), root)
     assert depth.metrics["dgc.fallback"] == FRAMES  # the road from normals

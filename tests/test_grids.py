@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from mtl_bench import grids, plugins
+from mtl_bench import grid_file, grids, plugins
 from mtl_bench.config import Cell, load_recipe
 from mtl_bench.grids import load_grid
 
@@ -38,12 +38,22 @@ def write(tmp_path):
 def test_shipped_grids_expand_and_name_existing_plugins():
     assert "backbones" in grids.grid_names()
     for name in grids.grid_names():
+        if grid_file.kind_of(grid_file.read(name)) != grid_file.TRAINING:
+            continue
         grid = load_grid(name)
         assert grid.name == name
+        assert load_grid(name, smoke=True).recipe.smoke
         assert grid.question.endswith("?")
         assert grids.question_of(name) == grid.question
         assert grid.cells
         plugins.check_cells([*grid.cells, *(skip.cell for skip in grid.skips)])
+
+
+def test_a_grid_may_name_its_smoke_recipe(write):
+    text = GRID.replace('recipe = "smoke"', 'recipe = "small"\nsmoke_recipe = "kitti-smoke"')
+    grid = load_grid(write(text), smoke=True)
+    assert (grid.name, grid.recipe.name) == ("mine-smoke", "kitti-smoke")
+    assert load_grid(write(text)).recipe.name == "small"
 
 
 def test_backbones_grid_is_the_papers_method_over_four_backbones():

@@ -107,13 +107,13 @@ def test_each_time_goes_to_its_stage(monkeypatch):
         return stage
 
     stages = [costing(1), costing(10), costing(5)]
-    times = latency._time_pass(stages, torch.zeros(1), torch.device("cpu"))
+    times = latency.time_pass(stages, torch.zeros(1), torch.device("cpu"))
     assert times == pytest.approx([1, 10, 5])
 
 
 def test_statistics_of_known_times():
     total = [10.0, 10, 10, 10, 10, 10, 15, 15]  # the last quarter is half as slow again
-    result = latency._statistics(latency.np.array([[1, t - 3, 2] for t in total]))
+    result = latency.statistics(latency.np.array([[1, t - 3, 2] for t in total]))
     assert result["mean_ms"] == pytest.approx(11.25)
     assert result["fps"] == pytest.approx(1000 / 11.25)
     assert result["p50_ms"] == pytest.approx(10)
@@ -193,7 +193,7 @@ def test_another_size_scales_image_and_intrinsics():
     result = measure(model, timing)
     assert (result["latency.height"], result["latency.width"]) == (64, 96)
     assert model.net.seen[-1].shape == (1, 3, 64, 96)
-    _, K_133 = latency._prepare(images(1), K_33, timing, pin=False)
+    _, K_133 = latency.prepare(images(1), K_33, timing, pin=False)
     assert K_133[0, 0].tolist() == pytest.approx([57.6 * 1.5, 0, 47.5])
     assert K_133[0, 1].tolist() == pytest.approx([0, 57.6 * 2, 31.5])
 

@@ -1,11 +1,19 @@
 import dataclasses
+import multiprocessing
+import os
+import signal
+import time
 from itertools import islice
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from cityscapes_tree import HEIGHT, WIDTH, file, open_tree, write_tree
 
 from mtl_bench import config
+from mtl_bench.data import loader
+from mtl_bench.data.cityscapes import Cityscapes
 from mtl_bench.data.loader import eval_batches, open_dataset, train_batches
 
 
@@ -123,6 +131,19 @@ def test_thread_count_changes_nothing(tmp_path):
         assert_same(one, two)
 
 
+def test_a_worker_of_a_process_that_used_opencvs_threads_starts():
+    """As the video stage's does, after pseudo labels: it hung for good."""
+    picture = np.zeros((2048, 4096, 3), np.uint8)
+    cv2.resize(picture, (1000, 1000), interpolation=cv2.INTER_AREA)
+    time.sleep(0.5)  # until the threads are asleep
+    worker = multiprocessing.get_context("fork").Process(target=loader._one_thread, args=(0,))
+    worker.start()
+    worker.join(20)
+    code = worker.exitcode
+    worker.kill()
+    assert code == 0
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_broken_file_is_one_line_from_any_process(tmp_path, workers):
     root = write_tree(tmp_path, 2)
@@ -131,6 +152,34 @@ def test_a_broken_file_is_one_line_from_any_process(tmp_path, workers):
     with pytest.raises(ValueError, match=f"^{path}: truncated PNG") as error:
         take(open_tree(root), 1, batch_size=2, workers=workers)
     assert "\n" not in str(error.value)
+
+
+def test_workers_hand_over_shared_memory_sample_by_sample(tree):
+    (batch,) = take(open_tree(tree), 1, workers=1)
+    for field in dataclasses.fields(batch):
+        value = getattr(batch, field.name)
+        if isinstance(value, torch.Tensor):
+            assert value.is_shared()
+            assert value.is_contiguous()
+
+
+def test_a_worker_that_the_system_ends_is_one_line(tree, monkeypatch):
+    dataset = open_tree(tree)
+    monkeypatch.setattr(Cityscapes, "sample", lambda *given: os.kill(os.getpid(), signal.SIGKILL))
+    message = r"process was ended .*lower recipe\.data\.workers"
+    with pytest.raises(ValueError, match=message) as error:
+        take(dataset, 1, workers=1)
+    assert "\n" not in str(error.value)
+
+
+def test_a_bug_in_a_worker_keeps_its_traceback(tree, monkeypatch):
+    def fail(*given):
+        raise RuntimeError("a bug")
+
+    dataset = open_tree(tree)
+    monkeypatch.setattr(Cityscapes, "sample", fail)
+    with pytest.raises(RuntimeError, match="in fail"):
+        take(dataset, 1, workers=1)
 
 
 def test_evaluation_goes_through_the_split_in_order(tree):

@@ -1,13 +1,15 @@
 """Grouping against a plain reference with loops, and the depth scale on planes of known height."""
 
+import importlib.util
 import math
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from mtl_bench import config, depth_scale, postprocess
+from mtl_bench import config, depth_scale, geometry, postprocess
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE
 from mtl_bench.data.targets import panoptic_targets
 from mtl_bench.metrics.panoptic import PanopticQuality
@@ -67,7 +69,7 @@ def reference(class_HW, heat_HW, offset_2HW, things, ev):
     ],
     ids=["plain", "filters", "top_k", "no_centers"],
 )
-def test_equals_the_rules_on_random_maps_full_of_ties(seed, ev, monkeypatch):
+def test_equals_the_rules_on_random_maps_full_of_ties(seed, ev):
     rng = np.random.default_rng(seed)
     shape = (3, 15, 18)
     classes = rng.choice([ROAD, SKY, PERSON, CAR, THINGS[-1], IGNORE], size=shape).astype(np.int64)
@@ -75,7 +77,6 @@ def test_equals_the_rules_on_random_maps_full_of_ties(seed, ev, monkeypatch):
     heat = (rng.integers(0, 5, shape) / 4).astype(np.float32)  # plateaus, equal peaks
     heat[0] *= seed % 2  # half of the time an image without centers beside others that have some
     offset = rng.integers(-4, 5, (3, 2, 15, 18)).astype(np.float32) / 2  # equal distances
-    monkeypatch.setattr(postprocess, "CPU_CHUNK", 100)
     result = postprocess.panoptic(
         torch.from_numpy(classes),
         torch.from_numpy(heat)[:, None],
@@ -85,6 +86,125 @@ def test_equals_the_rules_on_random_maps_full_of_ties(seed, ev, monkeypatch):
     )
     expected = [reference(*image, THINGS, ev) for image in zip(classes, heat, offset, strict=True)]
     np.testing.assert_array_equal(result.numpy(), np.stack(expected))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (2, 3)])
+@pytest.mark.parametrize("kernel", [1, 3, 7])
+def test_images_smaller_than_the_window(size, kernel):
+    rng = np.random.default_rng(kernel)
+    for _ in range(10):
+        classes = rng.choice([ROAD, CAR, PERSON, IGNORE], size=(2, *size)).astype(np.int64)
+        heat = (rng.integers(0, 4, (2, *size)) / 3).astype(np.float32)
+        offset = rng.normal(0, 2, (2, 2, *size)).astype(np.float32)
+        ev = settings(nms_kernel=kernel)
+        result = postprocess.panoptic(
+            torch.from_numpy(classes),
+            torch.from_numpy(heat)[:, None],
+            torch.from_numpy(offset),
+            THINGS,
+            ev,
+        )
+        images = zip(classes, heat, offset, strict=True)
+        expected = [reference(*image, THINGS, ev) for image in images]
+        np.testing.assert_array_equal(result.numpy(), np.stack(expected))
+
+
+def test_nothing_but_void():
+    nothing = torch.zeros(2, 2, 6, 6)
+    classes = torch.full((2, 6, 6), IGNORE)
+    result = postprocess.panoptic(classes, nothing[:, :1] + 1, nothing, THINGS, settings())
+    assert (result == postprocess.VOID).all()
+
+
+def test_a_window_over_several_strips(monkeypatch):
+    heat = torch.rand(2, 1, 23, 17, generator=torch.Generator().manual_seed(0))
+    whole = postprocess.find_centers(heat, settings(nms_kernel=7))
+    monkeypatch.setattr(postprocess, "STRIP", 2)
+    for a, b in zip(whole, postprocess.find_centers(heat, settings(nms_kernel=7)), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_batch_is_its_images():
+    generator = torch.Generator().manual_seed(0)
+    classes = torch.randint(0, len(CITYSCAPES20), (5, 20, 30), generator=generator)
+    heat = torch.rand(5, 1, 20, 30, generator=generator)
+    heat[2] = 0.1
+    offset = 3 * torch.randn(5, 2, 20, 30, generator=generator)
+    ev = settings(top_k=6, stuff_area=30)
+    batch = postprocess.panoptic(classes, heat, offset, THINGS, ev)
+    for i in range(5):
+        maps = (classes[i : i + 1], heat[i : i + 1], offset[i : i + 1])
+        assert torch.equal(postprocess.panoptic(*maps, THINGS, ev), batch[i : i + 1])
+
+
+def test_the_stuff_filter_of_an_exported_graph_is_the_same():
+    generator = torch.Generator().manual_seed(0)
+    classes = torch.randint(0, len(CITYSCAPES20), (3, 9, 14), generator=generator)
+    classes[0, 0] = IGNORE
+    counted = postprocess._stuff(postprocess.classes(classes), THINGS, 6)
+    assert torch.equal(counted, postprocess._stuff_by_class(classes.int(), THINGS, 6))
+    assert {0, 1000, postprocess.VOID} < set(counted.unique().tolist())
+
+
+def test_members_may_be_any_classes():
+    classes = torch.arange(256)
+    for chosen in ((0,), (255,), (3, 1, 2, 9), (0, 1, 254, 255), THINGS):
+        for dtype in (torch.uint8, torch.int32, torch.int64):
+            found = postprocess.member(classes.to(dtype), chosen)
+            assert found.nonzero()[:, 0].tolist() == sorted(chosen)
+
+
+def test_points_are_geometrys_and_nan_where_there_is_no_depth():
+    generator = torch.Generator().manual_seed(0)
+    depth = 1 + 50 * torch.rand(2, 1, 9, 16, generator=generator)
+    K = torch.tensor([[30.0, 0, 7], [0, 31, 4], [0, 0, 1]]).expand(2, 3, 3).clone()
+    K[1, 0, 0] = 40
+    points = postprocess.back_project(depth, K)
+    torch.testing.assert_close(points, geometry.back_project(depth, K))
+    depth[0, 0, 3, 5], depth[1, 0, 0, 0] = 0.0, math.nan
+    empty = postprocess.back_project(depth, K).isnan()
+    assert empty.sum() == 6
+    assert empty[0, :, 3, 5].all()
+    assert empty[1, :, 0, 0].all()
+
+
+def load_benchmark():
+    path = Path(__file__).parents[1] / "benchmarks" / "postprocess.py"
+    spec = importlib.util.spec_from_file_location("benchmark_of_postprocess", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # then the process' own time is taken: the machine may be busy
+    yield
+    torch.set_num_threads(threads)
+
+
+def test_200_instances_take_no_twice_the_time_of_5_and_little_memory(one_thread):
+    benchmark = load_benchmark()
+    finish = benchmark.finish()
+    few, many = (benchmark.scene(count) for count in (5, 200))
+    with torch.inference_mode():
+        assert finish(*many)["panoptic"].unique().numel() > 150
+        times = [
+            [benchmark.milliseconds(lambda s=scene: finish(*s)) for scene in (few, many)]
+            for _ in range(5)
+        ]
+        best_few, best_many = (min(column) for column in zip(*times, strict=True))
+        assert best_many < 2 * best_few
+        parts = benchmark.steps(many, config.Evaluate())
+        nearest, table = (
+            min(benchmark.milliseconds(parts[name]) for _ in range(3))
+            for name in ("- nearest", "(table)")
+        )
+        assert nearest < 0.5 * table
+        assert benchmark.peak_mib(lambda: finish(*many)) < 200
 
 
 def test_logits_are_the_same_as_their_classes():

@@ -15,7 +15,7 @@ from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench import checkpoint, pseudo_labels, results
+from mtl_bench import checkpoint, pseudo_frames, pseudo_labels, results
 from mtl_bench.cli import app
 from mtl_bench.config import Augment, Cell, Data, Evaluate, Loss, Network, PseudoLabels, Recipe
 from mtl_bench.data import synthetic
@@ -106,7 +106,7 @@ def written(folder, name):
     """The instance ids of a frame; its label ids must agree."""
     ids = read_instance_ids(file_of(folder, LABELS, name))
     label_ids = cv2.imread(
-        str(file_of(folder, pseudo_labels.LABEL_IDS, name)), cv2.IMREAD_UNCHANGED
+        str(file_of(folder, pseudo_frames.LABEL_IDS, name)), cv2.IMREAD_UNCHANGED
     )
     assert label_ids.dtype == np.uint8
     np.testing.assert_array_equal(label_ids, np.where(ids < 1000, ids, ids // 1000))
@@ -301,13 +301,13 @@ def test_stopped_and_called_again_it_writes_the_rest(
 
 
 def test_a_frame_counts_once_its_instance_ids_are_there(scenes, knowing, tmp_path, monkeypatch):
-    def fail(path, content, write=pseudo_labels._write):
+    def fail(path, content, write=pseudo_frames.write):
         if path.name.endswith("instanceIds.png"):
             raise KeyboardInterrupt
         write(path, content)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pseudo_labels, "_write", fail)
+        patch.setattr(pseudo_frames, "write", fail)
         with pytest.raises(KeyboardInterrupt):
             ensure(knowing(), CELL, scenes, tmp_path / "out", CPU)
     folder = tmp_path / "out" / "gtFine" / "train"

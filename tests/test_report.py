@@ -16,7 +16,6 @@ import rich.console
 from fake_rows import BASELINE, GRID, failed_row, grid_rows, make_row, write_runs
 
 from mtl_bench import config, report
-from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.report import formats, page, pictures, readme
 from mtl_bench.report.groups import SMOKE
 from mtl_bench.report.notes import footnotes
@@ -192,9 +191,8 @@ def test_the_same_rows_give_the_same_bytes(built, tmp_path):
 
 def test_all_files_are_there_and_small(built):
     figures = {f"{stem}.{kind}" for stem in report.FIGURES for kind in ("png", "svg")}
-    expected = {"index.html", "table.csv", "table.md", "readme.md", "table.tex", *figures} - {
-        "samples.svg"
-    }
+    expected = {"index.html", "table.csv", "table.md", "readme.md", "table.tex", *figures}
+    expected -= {"samples.svg", "extremes.svg"}
     assert {path.name for path in built.out.iterdir()} == expected
     assert sum(path.stat().st_size for path in built.out.iterdir()) < 6e5
     for path in built.out.glob("*.png"):
@@ -289,26 +287,6 @@ def test_scaling_failures_are_counted(built):
 # --- pictures -------------------------------------------------------------------------------------
 
 
-def test_overlay_colors_classes_and_outlines_instances():
-    image = np.full((8, 12, 3), 100, np.uint8)
-    ids = np.full((8, 12), 7, np.int32)
-    ids[2:6, 2:6], ids[:, 10:] = 26001, 0
-    drawn = pictures.overlay(image, ids, CITYSCAPES20)
-    road = CITYSCAPES20.colors[CITYSCAPES20.index("road")]
-    assert np.abs(drawn[7, 0] - (0.7 * road + 30)).max() <= 1
-    assert drawn[2, 2].tolist() == [255, 255, 255]
-    assert drawn[7, 11].tolist() == [100, 100, 100]
-    assert not np.array_equal(drawn[4, 4], drawn[7, 0])
-
-
-def test_depth_colors_fade_with_distance_and_show_gaps():
-    drawn = pictures.depth_colors(np.array([[2.0, 5, 10, 30, 80, 500, 0, np.nan]]))
-    brightness = drawn[0, :5].astype(int).sum(1)
-    assert (np.diff(brightness) < 0).all()
-    assert drawn[0, 5].tolist() == drawn[0, 4].tolist()
-    assert drawn[0, 6].tolist() == drawn[0, 7].tolist() == list(pictures.NO_DEPTH)
-
-
 def test_samples_without_a_task(tmp_path):
     rows = [make_row("a")]
     folder = tmp_path / rows[0]["slug"]
@@ -319,6 +297,22 @@ def test_samples_without_a_task(tmp_path):
     assert pictures.draw(tabulate(rows), tmp_path, tmp_path)
     height = cv2.imread(str(tmp_path / "samples.png")).shape[0]
     assert height < 2 * 96 + 26  # one line, not two
+
+
+def test_worst_and_best_frames_with_their_quality(tmp_path):
+    rows = [make_row("a"), make_row("b")]
+    runs = write_runs(tmp_path / "runs", rows)
+    former = runs / rows[0]["slug"] / "samples.npz"
+    values = {k: v for k, v in np.load(former).items() if not k.startswith("extremes")}
+    np.savez(former, **values)
+    caption = pictures.extremes(tabulate(rows), runs, tmp_path)
+    assert caption.endswith("of the frame alone: b 12.3 and 87.7.")
+    picture = cv2.imread(str(tmp_path / "extremes.png"))
+    assert picture.shape == (26 + 20 + 96 + 4, 6 * 196, 3)
+    truth, predicted = picture[46:-4, 196:388], picture[46:-4, 392:584]
+    assert not np.array_equal(truth, predicted)
+    assert pictures.extremes(tabulate(rows[:1]), runs, tmp_path) is None
+    assert pictures.draw(tabulate(rows), runs, tmp_path).startswith("Input, ground truth")
 
 
 # --- terminal and README --------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from mtl_bench import checkpoint, claim, launch, pseudo_labels, results
+from mtl_bench import checkpoint, claim, launch, pseudo_frames, results
 from mtl_bench.cli import app
 from mtl_bench.config import Cell, load_recipe, to_dict
 from mtl_bench.grids import with_parents
@@ -155,7 +155,7 @@ def copy_parent(cells, finished, runs):
 
 
 def crash_in_labels(monkeypatch):
-    write, count = pseudo_labels._write_frame, []
+    write, count = pseudo_frames.CityscapesFrames.write, []
 
     def some(*given):
         count.append(1)
@@ -163,7 +163,7 @@ def crash_in_labels(monkeypatch):
             raise KeyboardInterrupt
         write(*given)
 
-    monkeypatch.setattr(pseudo_labels, "_write_frame", some)
+    monkeypatch.setattr(pseudo_frames.CityscapesFrames, "write", some)
 
 
 def crash_in_training(monkeypatch):

@@ -116,3 +116,20 @@ def test_fast_enough_for_training():
         panoptic_targets(ids, CITYSCAPES20, LOSS)
         best = min(best, time.perf_counter() - start)
     assert best < 5e-3  # about 0.5 ms on an idle core, 32 instances in 64x128
+
+
+def test_many_segments_are_drawn_as_few_are(monkeypatch):
+    random = np.random.default_rng(1)
+    many = random.choice(np.arange(24000, 24400), (30, 40)).astype(np.int32)
+    assert len(np.unique(many)) > 256  # more than a byte tells apart
+    few = random.choice([7, 26, 24000, 26003, OUTSIDE], (30, 40)).astype(np.int32)
+    expected = panoptic_targets(few, CITYSCAPES20, LOSS)
+    monkeypatch.setattr("mtl_bench.data.targets._BYTE", 0)
+    for name, values in vars(panoptic_targets(few, CITYSCAPES20, LOSS)).items():
+        assert np.array_equal(values, getattr(expected, name)), name
+    targets = panoptic_targets(many, CITYSCAPES20, LOSS)
+    y, x = np.mgrid[:30, :40]
+    for instance in np.unique(many)[:20]:
+        inside = many == instance
+        assert (y + targets.offset[0])[inside].mean() == pytest.approx(y[inside].mean(), abs=1e-4)
+        assert (x + targets.offset[1])[inside].mean() == pytest.approx(x[inside].mean(), abs=1e-4)

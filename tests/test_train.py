@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,9 @@ import torch
 
 from mtl_bench import checkpoint
 from mtl_bench.config import Optim, to_dict
+from mtl_bench.curve import data_share
 from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.data.loader import train_batches
 from mtl_bench.engine import Engine, choose_device, seed_for
 from mtl_bench.progress import Interrupted, Progress
 from mtl_bench.results import write_json
@@ -140,6 +143,22 @@ def test_killed_just_after_a_checkpoint_the_curve_has_every_step(
     run(smoke_cell, smoke_root, on_disk)
     with (on_disk / "curve.csv").open() as file:
         assert [int(row["step"]) for row in csv.DictReader(file)] == [1, 2, 3, 4, 5, 6]
+
+
+def test_time_spent_waiting_for_batches_is_measured(smoke_cell, smoke_root, tmp_path, monkeypatch):
+    def slow(*given):
+        for batch in train_batches(*given):
+            time.sleep(0.2)
+            yield batch
+
+    monkeypatch.setattr("mtl_bench.train.train_batches", slow)
+    run(smoke_cell, smoke_root, tmp_path / "run")
+    rows = curve(tmp_path / "run")
+    assert all(200 <= float(row["data_ms"]) < float(row["step_ms"]) for row in rows)
+    waited, took = (sum(float(row[key]) for row in rows) for key in ("data_ms", "step_ms"))
+    share = data_share(tmp_path / "run" / "curve.csv")
+    assert share == pytest.approx(waited / took)
+    assert 0 < share < 1
 
 
 def test_seeds_differ_and_a_seed_repeats(smoke_cell, smoke_root, tmp_path):

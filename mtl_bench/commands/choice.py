@@ -9,6 +9,7 @@ from mtl_bench.commands import options as o
 
 if TYPE_CHECKING:
     from mtl_bench.grids import Grid
+    from mtl_bench.latency_grid import LatencyGrid
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,37 @@ class Choice:
             smoke=self.smoke,
             settings=self.settings or [],
             pretrained=o.weights(self.pretrained),
+        )
+
+    @property
+    def is_latency(self) -> bool:
+        """Whether the grid times networks instead of training cells."""
+        from mtl_bench import grid_file
+
+        return grid_file.kind_of(grid_file.read(self.grid)) == grid_file.LATENCY
+
+    def load_latency(self, device: o.Device = o.Device.auto) -> "LatencyGrid":
+        """The same of a grid that times networks.
+
+        Raises:
+            ValueError: as `latency_grid.load`, or an option that is about training.
+        """
+        from mtl_bench import latency_grid
+
+        for option, value in (("--seeds", self.seeds), ("--pretrained", self.pretrained)):
+            if value is not None:
+                raise ValueError(f"{option} {value}: grid '{self.grid}' times, and trains nothing")
+        settings = [f"recipe={self.recipe}"] if self.recipe is not None else []
+        kind = device.value
+        if kind == "auto":
+            from mtl_bench.engine import choose_device
+
+            kind = choose_device(kind).type
+        return latency_grid.load(
+            self.grid,
+            smoke=self.smoke,
+            settings=[*settings, *(self.settings or [])],
+            device=kind,
         )
 
     @property

@@ -1,6 +1,5 @@
 """`ablate`, `status` and `report`: a grid of cells."""
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mtl_bench.commands import latency_grid, tables, trivial
 from mtl_bench.commands import options as o
 from mtl_bench.commands.choice import Choice
-from mtl_bench.config import TASKS, Cell, to_dict
+from mtl_bench.config import Cell
 
 if TYPE_CHECKING:
     from mtl_bench.grids import Grid
@@ -69,12 +69,16 @@ def ablate(
     """Run what a grid still lacks, then write its report.
 
     Cells that are done are reused, interrupted and failed ones tried again; cells that others need
-    run before them, be they in the grid or not.
+    run before them, be they in the grid or not. A grid of latencies takes them one at a time.
     """
     from mtl_bench import launch
     from mtl_bench.plugins import check_cells
 
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
+    if choice.is_latency:
+        where = (data, runs, reports)
+        latency_grid.ablate(choice, dry_run, jobs, rerun, *where, device, wandb, quiet)
+        return
     chosen = choice.load()
     check_cells(chosen.cells)
     todo = launch.to_run(chosen.cells, runs, rerun)
@@ -116,7 +120,11 @@ def status(
     from mtl_bench.display import label
     from mtl_bench.grids import with_parents
 
-    chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
+    choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
+    if choice.is_latency:
+        latency_grid.status(choice, runs)
+        return
+    chosen = choice.load()
     own, every = {cell.id for cell in chosen.cells}, with_parents(chosen.cells)
     lines = []
     for cell in every:
@@ -134,7 +142,8 @@ def status(
 
 
 def report(
-    grid: o.GridOption,
+    grid: tables.GridOption = None,
+    table: tables.TableOption = None,
     recipe: o.RecipeOption = None,
     seeds: o.SeedsOption = None,
     smoke: o.SmokeOption = False,
@@ -153,18 +162,26 @@ def report(
     plugins: o.PluginsOption = None,
 ) -> None:
     """Write a grid's tables, plots and page from the rows that there are."""
+    if table is not None or grid is None:
+        choices = (recipe, seeds, smoke, settings, pretrained)
+        tables.write(table, Choice(grid, *choices) if grid else None, runs, reports, smoke)
+        return
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
-    chosen = choice.load()
-    if not any("metric" in row for row in _rows(chosen, runs)):
-        raise ValueError(
-            f"no cell of grid '{chosen.name}' is done in '{runs}': mtl-bench ablate --grid {grid}"
-        )
-    page = _write(chosen, runs, reports, choice.command)
+    if choice.is_latency:
+        page = latency_grid.report(choice, runs, reports)
+    else:
+        chosen = choice.load()
+        if not any("metric" in row for row in _rows(chosen, runs)):
+            raise ValueError(
+                f"no cell of grid '{chosen.name}' is done in '{runs}': "
+                f"mtl-bench ablate --grid {grid}"
+            )
+        page = _write(chosen, runs, reports, choice.command)
     typer.echo(str(page))
     if readme is not None:
         from mtl_bench.report.readme import update
 
-        update(readme, chosen.name, page.parent)
+        update(readme, page.parent.name, page.parent)
         typer.echo(str(readme))
 
 
@@ -241,7 +258,7 @@ def _rows(grid: "Grid", runs: Path) -> list[dict[str, Any]]:
 def _write(grid: "Grid", runs: Path, reports: Path, command: str) -> Path:
     from mtl_bench import report as reporting
 
-    file = _baseline_file(grid, runs)
+    file = trivial.file_of(grid, runs)
     baseline = json.loads(file.read_text()) if file is not None and file.is_file() else None
     return reporting.build(
         grid,
@@ -262,30 +279,12 @@ def _baseline(
     """
     from mtl_bench import results
 
-    file = _baseline_file(grid, runs)
+    file = trivial.file_of(grid, runs)
     if file is None or (file.is_file() and not refresh):
         return
     from mtl_bench.baselines import baselines
 
     file.parent.mkdir(parents=True, exist_ok=True)
     root = o.data_root(grid.cells[0], data, quiet)
-    cell = replace(grid.cells[0], tasks=_tasks(grid), video=False, single_task=False)
+    cell = replace(grid.cells[0], tasks=trivial.tasks_of(grid), video=False, single_task=False)
     results.write_json(file, baselines(cell, root, file.parent).metrics)
-
-
-def _baseline_file(grid: "Grid", runs: Path) -> Path | None:
-    """Where they are kept; None for a grid over several data sets or protocols."""
-    tasks = _tasks(grid)
-    settings = {
-        json.dumps([to_dict(cell.recipe.data), to_dict(cell.recipe.evaluate), tasks])
-        for cell in grid.cells
-    }
-    if len(settings) != 1:
-        return None
-    key = hashlib.sha256(settings.pop().encode()).hexdigest()[:12]
-    return runs / "baselines" / f"trivial-{key}.json"
-
-
-def _tasks(grid: "Grid") -> tuple[str, ...]:
-    """Those that some cell has."""
-    return tuple(task for task in TASKS if any(task in cell.tasks for cell in grid.cells))

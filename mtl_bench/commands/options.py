@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mtl_bench.config import Cell
+from mtl_bench.data.layouts import BUILT_IN, IMAGES, LAYOUTS, layout_of
 
 RUNNING, GRID = "Where and how to run", "Which cells"
 
@@ -49,8 +50,8 @@ DataOption = Annotated[
     typer.Option(
         "--data",
         metavar="DIR",
-        help="Root of the data set, in Cityscapes' layout. Without it the built-in scenes are "
-        "rendered into the user's cache on first use.",
+        help="Root of the data set, in Cityscapes' layout or KITTI raw's. Without it the built-in "
+        "scenes are rendered into the user's cache on first use.",
         rich_help_panel=RUNNING,
         show_default=False,
     ),
@@ -147,22 +148,47 @@ def locate(cell: Cell, data: Path | None) -> Path | None:
     """Where a cell's images are; None for the built-in ones. Renders nothing.
 
     Raises:
-        ValueError: no data set there, or a recipe for a data set that only `--data` can find.
+        ValueError: no data set there, one in another layout than the recipe's, or a recipe for a
+            data set that only `--data` can find.
     """
+    name = cell.recipe.data.dataset
     if data is not None:
-        if not data.is_dir():
-            raise ValueError(f"no data folder '{data}'")
-        if not any(path.name == "leftImg8bit" for path in data.iterdir()):
+        layout, expected = _layout(data), LAYOUTS.get(name)
+        if expected not in (None, layout):
             raise ValueError(
-                f"no data set in '{data}': it lacks leftImg8bit/ (mtl-bench data check says more)"
+                f"'{data}' is in {layout}'s layout, but recipe '{cell.recipe.name}' trains on "
+                f"{name}: choose another --data, --recipe or recipe.data.dataset"
             )
         return data.resolve()
-    name = cell.recipe.data.dataset
-    if name != "synthetic":
+    if name not in BUILT_IN:
         raise ValueError(
             f"recipe '{cell.recipe.name}' trains on {name}: say where it is, --data DIR"
         )
     return None
+
+
+def any_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:
+    """As `data_root`, in any layout: for what does not train.
+
+    Raises:
+        ValueError: no data set there.
+    """
+    if data is None:
+        return data_root(cell, None, quiet)
+    _layout(data)
+    return data.resolve()
+
+
+def _layout(data: Path) -> str:
+    if not data.is_dir():
+        raise ValueError(f"no data folder '{data}'")
+    layout = layout_of(data)
+    if layout is None:
+        raise ValueError(
+            f"no data set in '{data}': it has neither {IMAGES}/ (Cityscapes) nor days such as "
+            f"2011_09_26/ (KITTI raw)"
+        )
+    return layout
 
 
 def data_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:

@@ -1,4 +1,4 @@
-"""`pseudo-label`: labels for the frames of a video that have none, from a trained cell."""
+"""`pseudo-label`: labels for frames that no human labelled, from a trained cell."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,18 +23,23 @@ def pseudo_label(
         Path, typer.Option(metavar="RUN|CHECKPOINT", help="A folder in runs/, or its last.pt.")
     ],
     out: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             metavar="DIR",
-            help="Where the labels go, in Cityscapes' format; a run that was stopped goes on.",
+            help="Where the labels go, in Cityscapes' format; a run that was stopped goes on. "
+            "KITTI's go beside its images without this.",
+            show_default=False,
         ),
-    ],
-    split: Annotated[str, typer.Option(metavar="NAME", help="Whose sequences.")] = "train",
+    ] = None,
+    split: Annotated[
+        str, typer.Option(metavar="NAME", help="Whose frames; of KITTI also: all.")
+    ] = "train",
     scales: Annotated[
         str | None,
         typer.Option(
             metavar="X,X,...",
-            help="Sizes of the input to average over, 1 = the recipe's; in place of the recipe's.",
+            help="Sizes of the input to average over, 1 = the recipe's, or of KITTI the frame's "
+            "own; in place of the recipe's.",
             show_default=False,
         ),
     ] = None,
@@ -59,7 +64,8 @@ def pseudo_label(
     plugins: o.PluginsOption = None,
     quiet: o.QuietOption = False,
 ) -> None:
-    """Label the frames of leftImg8bit_sequence that no human labelled; no label is overwritten."""
+    """Label the frames of Cityscapes' sequences that no human labelled, or KITTI's, with a network
+    that was trained on Cityscapes. No label is overwritten."""
     from mtl_bench import results
 
     if not checkpoint.exists():
@@ -68,7 +74,7 @@ def pseudo_label(
     cell = results.load_cell(weights.parent / "cell.json")
     chosen = _options(cell.recipe.pseudo, scales, flip, min_confidence)
     cell = replace(cell, recipe=replace(cell.recipe, pseudo=chosen))
-    root = o.data_root(cell, data, quiet)
+    root = o.any_root(cell, data, quiet)
 
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn

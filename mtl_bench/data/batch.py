@@ -16,7 +16,7 @@ from torch import Tensor
 
 @dataclass
 class Batch:
-    names: list[str]  # city_sequence_frame
+    names: list[str]  # city_sequence_frame, or KITTI's drive_camera_frame
     image_B3HW: Tensor  # what the network sees: colour-jittered in training
     K_B33: Tensor  # intrinsics in pixels of image_B3HW
     camera_height_m_B: Tensor

@@ -49,6 +49,7 @@ class Report:
     problems: list[Problem] = field(default_factory=list)
     unlabelled: int = 0
     reprojection_mask: str = "labels"
+    size: tuple[int, int] = (0, 0)  # of an image, height and width
 
     def obstacle(self, purpose: str) -> str | None:
         """Why a purpose of NEEDS is out of reach; None where nothing is in its way."""
@@ -145,7 +146,8 @@ def _check_split(report: Report, split: str, names: list[str], deep: bool) -> No
                     own_size = _check_file(path, kind, deep)
                     if own_size and size:
                         files.check_same_size(path, own_size, image_path, size)
-                    size = own_size if kind is IMAGE else size
+                    if kind is IMAGE and own_size:
+                        report.size = size = own_size
                 except ValueError as error:
                     report.problems.append(Problem(split, kind, "bad", str(error)))
 

@@ -2,10 +2,12 @@
 
 A training sample is an augmented frame, its neighbours in time where a task needs them, and the
 panoptic targets; an evaluation sample is the plain frame with ground truth at the frame's own size.
-Frames larger than the recipe's input are shrunk to it once, intrinsics and labels with them.
+Frames larger than the recipe's input are shrunk to it, intrinsics and labels with them: on every
+reading, or once where `mtl-bench data cache` wrote them down.
 """
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +19,12 @@ from torch import Generator, Tensor
 
 from mtl_bench import config
 from mtl_bench.data import cityscapes_files as files
+from mtl_bench.data import frame_cache
 from mtl_bench.data.augment import augment as draw_augmented
 from mtl_bench.data.augment import scale
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE, Kind
+from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
 from mtl_bench.data.targets import OUTSIDE, panoptic_targets
 
@@ -32,7 +36,7 @@ _PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=
 class _Frame:
     """What is kept of a decoded frame; everything random comes later."""
 
-    images_N3HW: Tensor  # uint8, input size; in training followed by previous and next
+    images_N3HW: Sequence[Tensor]  # uint8, input size; in training followed by previous and next
     K_33: Tensor
     camera_height_m: float
     camera_pitch_rad: float
@@ -82,6 +86,7 @@ class Cityscapes:
         self.sequence_labels = sequence_labels
         self._augment = augment or _PLAIN
         self._cache: dict[tuple[int, bool], _Frame] | None = {} if data.cache else None
+        self.on_disk = FrameCache(root, data, self._to_input)
         self.names = files.annotated_names(root, split)
         self._annotated = frozenset(self.names)
         self._label_files = self._find_labels()
@@ -107,10 +112,21 @@ class Cityscapes:
         """Whether masks may leave the sky in: only labels know where it is."""
         return self.reprojection_mask != "labels"
 
+    def sources(self, training: bool) -> list[Source]:
+        """The files that samples are made of and that `on_disk` can hold."""
+        images = [self._image_file(name) for name in self.names]
+        if training and self.video:
+            around = {files.neighbour(name, step) for name in self.names for step in (-1, 1)}
+            images += sorted({self._file(SEQUENCE, name) for name in around}.difference(images))
+        labels = [self._label_files[name] for name in self.names if name in self._label_files]
+        sources = [(path, frame_cache.IMAGE) for path in images]
+        return sources + [(path, frame_cache.LABELS) for path in labels if training]
+
     def uncached(self) -> "Cityscapes":
         """The same split, remembering nothing: for worker processes, which would each hold it."""
         other = copy.copy(self)
         other._cache = None
+        other.on_disk = FrameCache(self.root, self.data, other._to_input)
         return other
 
     def sample(self, index: int, generator: Generator | None) -> Batch:
@@ -138,7 +154,7 @@ class Cityscapes:
     def _evaluation_sample(self, name: str, frame: _Frame) -> Batch:
         return Batch(
             names=[name],
-            image_B3HW=frame.images_N3HW[0].float() / 255,
+            image_B3HW=frame.images_N3HW[0].contiguous().float() / 255,
             K_B33=frame.K_33,
             camera_height_m_B=torch.tensor(frame.camera_height_m),
             camera_pitch_rad_B=torch.tensor(frame.camera_pitch_rad),
@@ -149,7 +165,7 @@ class Cityscapes:
     def _training_sample(self, name: str, frame: _Frame, generator: Generator) -> Batch:
         ids = frame.instance_ids
         if ids is None:  # no label file: unlabeled everywhere, so that padding can still be marked
-            ids = torch.zeros(frame.images_N3HW.shape[-2:], dtype=torch.int32)
+            ids = torch.zeros(frame.images_N3HW[0].shape[-2:], dtype=torch.int32)
         view = draw_augmented(frame.images_N3HW, frame.K_33, ids, self._augment, generator)
         batch = Batch(
             names=[name],
@@ -177,34 +193,34 @@ class Cityscapes:
 
     def _read(self, name: str, training: bool) -> _Frame:
         path = self._image_file(name)
-        images = [files.read_image(path)]
-        own_size = images[0].shape[:2]
+        images = [self.on_disk.read(path, frame_cache.IMAGE)]
+        own_size = images[0].own_size
+        frame = (path, own_size)
         if training and self.video:
-            for step in (-1, 1):
-                neighbour_path = self._file(SEQUENCE, files.neighbour(name, step))
-                images.append(files.read_image(neighbour_path))
-                files.check_same_size(neighbour_path, images[-1].shape, path, own_size)
+            around = [self._file(SEQUENCE, files.neighbour(name, step)) for step in (-1, 1)]
+            images += [self.on_disk.read(beside, frame_cache.IMAGE, frame) for beside in around]
         camera = files.read_camera(self._file(CAMERA, self._camera_names[name]))
         K = torch.tensor([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
 
         ids = depth_m = None
         if self.panoptic or (name in self._label_files and (self.video or not training)):
             label_path = self._label_files[name]
-            ids = files.read_instance_ids(label_path)
-            files.check_same_size(label_path, ids.shape, path, own_size)
+            if training:
+                ids = self.on_disk.read(label_path, frame_cache.LABELS, frame).pixels
+            else:
+                ids = files.read_instance_ids(label_path)
+                files.check_same_size(label_path, ids.shape, *frame)
         elif training and self.video and self._ego_mask is not None:
             ids = self._ego_mask
-            files.check_same_size(self.root / files.EGO_MASK.suffix, ids.shape, path, own_size)
-        if training and ids is not None:
+            files.check_same_size(self.root / files.EGO_MASK.suffix, ids.shape, *frame)
             ids = self._to_input(ids, path, cv2.INTER_NEAREST_EXACT)
         if self.video and not training:
             depth_path = self._file(DISPARITY, name)
             depth_m = files.read_depth_m(depth_path, camera)
-            files.check_same_size(depth_path, depth_m.shape, path, own_size)
+            files.check_same_size(depth_path, depth_m.shape, *frame)
 
-        images = [self._to_input(image, path, cv2.INTER_AREA) for image in images]
         return _Frame(
-            images_N3HW=torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous(),
+            images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
             K_33=scale(K, self.data.width / own_size[1], self.data.height / own_size[0]),
             camera_height_m=camera.height_m,
             camera_pitch_rad=camera.pitch_rad,
@@ -252,20 +268,13 @@ class Cityscapes:
 
     def _find_cameras(self) -> dict[str, str]:
         """Whose camera file holds for a frame: its own, or its snippet's annotated frame's."""
-        known: dict[tuple[str, str], dict[int, str]] = {}
-        for name in sorted(self._annotated):
-            city, sequence, frame = files.split_name(name)
-            known.setdefault((city, sequence), {})[frame] = name
-        cameras = {name: name for name in self._annotated}
-        for name in set(self.names) - self._annotated:
-            city, sequence, frame = files.split_name(name)
-            if (city, sequence) not in known:
+        cameras = files.camera_names(self._annotated, set(self.names))
+        for name in self.names:
+            if name not in cameras:
                 raise ValueError(
                     f"{self._label_files[name]}: no annotated frame in its sequence, so no camera "
                     f"file; remove these labels or complete {self._folder(IMAGE)}"
                 )
-            near = known[city, sequence]
-            cameras[name] = near[min(near, key=lambda other: abs(other - frame))]
         return cameras
 
     def _require_files(self, training: bool) -> None:

@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,6 +122,22 @@ def unlabelled_names(root: Path, split: str) -> list[str]:
     sequences = {split_name(name)[:2] for name in annotated_names(root, split)}
     own = {name for name in present - labelled if split_name(name)[:2] in sequences}
     return sorted(with_neighbours(own, present))
+
+
+def camera_names(annotated: Set[str], names: Set[str]) -> dict[str, str]:
+    """Whose camera file holds for a frame: its own, or that of its sequence's nearest annotated
+    frame; frames of other sequences are left out."""
+    known: dict[tuple[str, str], dict[int, str]] = {}
+    for name in sorted(annotated):
+        city, sequence, frame = split_name(name)
+        known.setdefault((city, sequence), {})[frame] = name
+    cameras = {name: name for name in annotated}
+    for name in names - annotated:
+        city, sequence, frame = split_name(name)
+        if (city, sequence) in known:
+            near = known[city, sequence]
+            cameras[name] = near[min(near, key=lambda other: abs(other - frame))]
+    return cameras
 
 
 def reprojection_mask(frames: int, labelled: int, ego_mask: bool) -> str:

@@ -88,6 +88,13 @@ _EVALUATED = (
 
 CITYSCAPES20 = LabelSet("cityscapes20", (_EGO, *_EVALUATED))
 CITYSCAPES19 = LabelSet("cityscapes19", _EVALUATED)
+_WITHOUT_EGO = ("kitti", "synthetic-kitti")  # their cameras do not see the car they are mounted on
+
+
+def labels_of(dataset: str) -> LabelSet:
+    """What a network for this data set predicts (`recipe.data.dataset`)."""
+    return CITYSCAPES19 if dataset in _WITHOUT_EGO else CITYSCAPES20
+
 
 # Every label id that Cityscapes' files may hold; those in no LabelSet are void. -1 is not written.
 KNOWN_LABEL_IDS = frozenset(range(34))

@@ -5,47 +5,86 @@ A run that starts at any step, in one process or several, therefore sees the sam
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 from mtl_bench.config import Cell, did_you_mean
 from mtl_bench.data.batch import Batch, collate
 from mtl_bench.data.cityscapes import Cityscapes
+from mtl_bench.data.kitti import Kitti
+from mtl_bench.data.labels import labels_of
+from mtl_bench.data.layouts import KITTI, LAYOUTS
 
-DATASETS = ("synthetic", "cityscapes")  # two names of one layout
+# Batches that each worker has ready or under way. One is enough: a worker goes on as soon as its
+# batch is fetched, and every further one takes a batch's memory (1.3 GB at the paper's size).
+AHEAD = 1
+_DIED = "DataLoader worker (pid"  # how torch's error begins
 
 
 def open_dataset(
-    cell: Cell, split: str, root: Path, training: bool, sequence_labels: Path | None = None
+    cell: Cell,
+    split: str,
+    root: Path,
+    training: bool,
+    sequence_labels: Path | None = None,
+    truth: str = "default",
 ) -> Cityscapes:
     """The split as the cell's recipe and tasks want it.
+
+    Args:
+        sequence_labels: of the video stage, see `Cityscapes`; KITTI has none.
+        truth: depth to evaluate on. Cityscapes: disparity; KITTI: see `Kitti`; default: either's.
 
     Raises:
         ValueError: an unknown data set, or a folder that lacks what the tasks need.
     """
     recipe = cell.recipe
-    if recipe.data.dataset not in DATASETS:
-        known = did_you_mean(recipe.data.dataset, DATASETS)
+    layout = LAYOUTS.get(recipe.data.dataset)
+    if layout is None:
+        known = did_you_mean(recipe.data.dataset, LAYOUTS)
         raise ValueError(f"no data set called '{recipe.data.dataset}'{known}")
+    tasks = {"video": "depth" in cell.tasks, "panoptic": "panoptic" in cell.tasks}
+    augment = recipe.augment if training else None
+    labels = labels_of(recipe.data.dataset)
+    if layout == KITTI:
+        assert sequence_labels is None, "pseudo_labels.ensure makes none"
+        return Kitti(
+            root,
+            split,
+            recipe.data,
+            labels,
+            **tasks,
+            augment=augment,
+            loss=recipe.loss,
+            truth=truth,
+        )
+    if truth not in ("default", "disparity"):
+        raise ValueError(f"{recipe.data.dataset} has no depth truth '{truth}': it has disparity")
     return Cityscapes(
         root,
         split,
         recipe.data,
-        video="depth" in cell.tasks,
-        panoptic="panoptic" in cell.tasks,
-        augment=recipe.augment if training else None,
+        labels,
+        **tasks,
+        augment=augment,
         loss=recipe.loss,
         sequence_labels=sequence_labels,
     )
 
 
 def train_batches(
-    dataset: Cityscapes, batch_size: int, seed: int, start_step: int = 0, workers: int = 0
+    dataset: Cityscapes,
+    batch_size: int,
+    seed: int,
+    start_step: int = 0,
+    workers: int = 0,
+    pinned: bool = False,
 ) -> Iterator[Batch]:
     """Batches of step `start_step`, `start_step + 1`, ... without end.
 
@@ -57,9 +96,11 @@ def train_batches(
         seed: the run's seed.
         start_step: the first batch to yield; how a stopped run goes on.
         workers: processes that prepare batches; they keep no decoded frames. 0: this one.
+        pinned: with workers, batches in memory from which a GPU copies by itself.
 
     Raises:
-        ValueError: a batch larger than the split.
+        ValueError: a batch larger than the split; while iterating, a broken file, or workers that
+            the system ended.
     """
     if not 0 < batch_size <= len(dataset):
         raise ValueError(
@@ -68,54 +109,108 @@ def train_batches(
         )
     steps = _Steps(len(dataset), batch_size, seed, start_step)
     if workers == 0:
-        return (_make_batch(dataset, slots) for slots in steps)
-    return _from_workers(dataset.uncached(), steps, workers)
+        return (collate(list(_samples(dataset, slots))) for slots in steps)
+    return _from_workers(dataset.uncached(), steps, workers, pinned)
 
 
 def eval_batches(dataset: Cityscapes, batch_size: int) -> Iterator[Batch]:
-    """The whole split in order, without augmentation; the last batch may be smaller."""
-    for start in range(0, len(dataset), batch_size):
-        indices = range(start, min(start + batch_size, len(dataset)))
-        yield collate([dataset.sample(index, None) for index in indices])
+    """The whole split in order, without augmentation.
+
+    A batch is smaller where the split ends, or where the next frame's truth has another size.
+    """
+    samples: list[Batch] = []
+    for index in range(len(dataset)):
+        sample = dataset.sample(index, None)
+        if samples and (len(samples) == batch_size or _sizes(sample) != _sizes(samples[0])):
+            yield collate(samples)
+            samples = []
+        samples.append(sample)
+    if samples:
+        yield collate(samples)
+
+
+def _sizes(sample: Batch) -> list[torch.Size | None]:
+    truths = (sample.instance_ids_BHW, sample.depth_m_BHW)
+    return [None if truth is None else truth.shape for truth in truths]
 
 
 Slot = tuple[int, int]  # index of a sample, seed of its augmentation
 
 
-def _make_batch(dataset: Cityscapes, slots: list[Slot]) -> Batch:
-    return collate([dataset.sample(index, Generator().manual_seed(seed)) for index, seed in slots])
+def _samples(dataset: Cityscapes, slots: list[Slot]) -> Iterator[Batch]:
+    return (dataset.sample(index, Generator().manual_seed(seed)) for index, seed in slots)
 
 
-def _from_workers(dataset: Cityscapes, steps: "_Steps", workers: int) -> Iterator[Batch]:
+def _from_workers(
+    dataset: Cityscapes, steps: "_Steps", workers: int, pinned: bool
+) -> Iterator[Batch]:
     loader = torch.utils.data.DataLoader(
         _Batches(dataset),
         sampler=steps,
         batch_size=None,  # an item is a whole batch
         num_workers=workers,
+        prefetch_factor=AHEAD,
+        pin_memory=pinned,
         worker_init_fn=_one_thread,
         generator=Generator(),  # else it draws a seed from the global one, which training uses
     )
-    for batch in loader:
-        if isinstance(batch, ValueError):
-            raise batch
-        yield batch
+    batches = iter(loader)
+    while True:
+        try:
+            fields = next(batches)
+        except RuntimeError as error:
+            if not str(error).startswith(_DIED):
+                raise
+            raise ValueError(
+                f"a data-loading process was ended ({str(error).splitlines()[0]}): lower "
+                f"recipe.data.workers, or give it more memory and /dev/shm more room"
+            ) from error
+        if isinstance(fields, ValueError):
+            raise fields
+        yield Batch(**fields)
 
 
 class _Batches(torch.utils.data.Dataset):
     def __init__(self, dataset: Cityscapes) -> None:
         self.dataset = dataset
 
-    def __getitem__(self, slots: list[Slot]) -> Batch | ValueError:
-        """A batch, or what is wrong with a file: torch would bury that line in a traceback."""
+    def __getitem__(self, slots: list[Slot]) -> dict[str, Any] | ValueError:
+        """A batch's fields, or what is wrong with a file: torch would bury that line in a
+        traceback. A plain dictionary is what torch knows how to pin."""
         try:
-            return _make_batch(self.dataset, slots)
+            return _collate_shared(_samples(self.dataset, slots), len(slots))
         except ValueError as error:
             return error
 
 
+def _collate_shared(samples: Iterable[Batch], count: int) -> dict[str, Any]:
+    """As `collate`, but straight into the memory that processes share, and sample by sample: one
+    copy less, and not all samples beside the batch, which takes a gigabyte of Cityscapes' frames.
+    """
+    fields: dict[str, Any] = {"names": []}
+    for slot, sample in enumerate(samples):
+        fields["names"] += sample.names
+        for name, value in vars(sample).items():
+            if isinstance(value, Tensor):
+                if slot == 0:
+                    fields[name] = _shared(count, value)
+                fields[name][slot] = value
+    return fields
+
+
+def _shared(count: int, like: Tensor) -> Tensor:
+    """Room for so many such tensors, got in the way of torch's own default_collate."""
+    storage = torch.UntypedStorage._new_shared(count * like.nbytes)
+    return like.new_empty(0).set_(storage).view(count, *like.shape)
+
+
 def _one_thread(worker: int) -> None:
-    """As torch does in its workers: more threads than cores would fight over them."""
-    cv2.setNumThreads(1)
+    """As torch does in its workers: more threads than cores would fight over them.
+
+    0 means none beside this one. 1 would too, but first ends the threads of the pool, which a fork
+    of a process that has used its own does not have, and waits for them forever.
+    """
+    cv2.setNumThreads(0)
 
 
 class _Steps:

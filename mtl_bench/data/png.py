@@ -36,7 +36,7 @@ def read(path: Path, bits: int, color: bool = False) -> NDArray[Any]:
         raise ValueError(f"{path}: damaged PNG; copy or unpack the file again")
     if image.ndim != 2 + color:
         raise ValueError(f"{path}: {image.shape[2]} channels where one is expected")
-    return np.ascontiguousarray(image[..., ::-1]) if color else image
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if color else image
 
 
 def read_header(path: Path) -> Header:

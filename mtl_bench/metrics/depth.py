@@ -6,30 +6,47 @@ vehicle is compared as well (MGNet's public code sets those pixels to 0 first, w
 depth error to the segmentation).
 """
 
+import typing
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench import config
-
 NAMES = ("abs_rel", "sq_rel", "rmse", "rmse_log", "delta1", "delta2", "delta3")
+CROPS = {  # first and one-past-last row, then column: shares of the truth's size, rounded down
+    "none": (0.0, 1.0, 0.0, 1.0),
+    "garg": (0.40810811, 0.99189189, 0.03594771, 0.96405229),  # Garg et al., ECCV 2016: KITTI
+    # ManyDepth's code (Watson et al., CVPR 2021), Cityscapes: without the lowest quarter, rows 256+
+    # and columns 192:1856 of 1024 x 2048
+    "manydepth": (256 / 1024, 768 / 1024, 192 / 2048, 1856 / 2048),
+}
 
 
-def evaluation_mask(true_m_HW: NDArray, ev: config.Evaluate) -> NDArray[np.bool_]:
-    """Pixels that count. `ev.depth_crop`: none, or garg (Garg et al., ECCV 2016: KITTI's crop).
+class Limits(typing.Protocol):
+    """Which pixels count, and the range that predictions are clamped to."""
+
+    @property
+    def min_depth_m(self) -> float: ...
+    @property
+    def max_depth_m(self) -> float: ...
+    @property
+    def depth_crop(self) -> str: ...
+
+
+def evaluation_mask(true_m_HW: NDArray, limits: Limits) -> NDArray[np.bool_]:
+    """Pixels that count: strictly inside the range and, by `depth_crop`, one of CROPS.
 
     Raises:
         ValueError: another crop.
     """
-    mask_HW = (true_m_HW > ev.min_depth_m) & (true_m_HW < ev.max_depth_m)
-    if ev.depth_crop == "garg":
-        height, width = true_m_HW.shape
-        inside_HW = np.zeros_like(mask_HW)
-        rows = slice(int(0.40810811 * height), int(0.99189189 * height))
-        inside_HW[rows, int(0.03594771 * width) : int(0.96405229 * width)] = True
-        mask_HW &= inside_HW
-    elif ev.depth_crop != "none":
-        raise ValueError(f"evaluate.depth_crop must be none or garg, not '{ev.depth_crop}'")
-    return mask_HW
+    if limits.depth_crop not in CROPS:
+        known = ", ".join(CROPS)
+        raise ValueError(f"evaluate.depth_crop must be one of {known}, not '{limits.depth_crop}'")
+    top, bottom, left, right = CROPS[limits.depth_crop]
+    height, width = true_m_HW.shape
+    inside_HW = np.zeros(true_m_HW.shape, np.bool_)
+    rows = slice(int(top * height), int(bottom * height))
+    inside_HW[rows, int(left * width) : int(right * width)] = True
+    return inside_HW & (true_m_HW > limits.min_depth_m) & (true_m_HW < limits.max_depth_m)
 
 
 def median_scale(predicted_HW: NDArray, true_m_HW: NDArray, mask_HW: NDArray[np.bool_]) -> float:
@@ -38,14 +55,14 @@ def median_scale(predicted_HW: NDArray, true_m_HW: NDArray, mask_HW: NDArray[np.
 
 
 def depth_errors(
-    predicted_m: NDArray, true_m: NDArray, mask: NDArray[np.bool_], ev: config.Evaluate
+    predicted_m: NDArray, true_m: NDArray, mask: NDArray[np.bool_], limits: Limits
 ) -> dict[str, float]:
     """Errors of one image over the mask: relative ones and deltas as fractions, rmse in metres.
 
-    The prediction is clamped to `ev`'s range first, after any scaling.
+    The prediction is clamped to the range first, after any scaling.
     """
     true = true_m[mask].astype(np.float64)
-    predicted = predicted_m[mask].astype(np.float64).clip(ev.min_depth_m, ev.max_depth_m)
+    predicted = predicted_m[mask].astype(np.float64).clip(limits.min_depth_m, limits.max_depth_m)
     difference = predicted - true
     ratio = np.maximum(predicted / true, true / predicted)
     values = (
@@ -61,16 +78,16 @@ def depth_errors(
 class DepthErrors:
     """Mean over images of per-image errors. An image without a valid pixel is only counted."""
 
-    def __init__(self, ev: config.Evaluate) -> None:
-        self.ev = ev
+    def __init__(self, limits: Limits) -> None:
+        self.limits = limits
         self.errors: list[dict[str, float]] = []
         self.without_truth = 0
 
     def update(self, predicted_m_HW: NDArray, true_m_HW: NDArray) -> None:
         """Add an image; the prediction is in metres already."""
-        mask_HW = evaluation_mask(true_m_HW, self.ev)
+        mask_HW = evaluation_mask(true_m_HW, self.limits)
         if mask_HW.any():
-            self.errors.append(depth_errors(predicted_m_HW, true_m_HW, mask_HW, self.ev))
+            self.errors.append(depth_errors(predicted_m_HW, true_m_HW, mask_HW, self.limits))
         else:
             self.without_truth += 1
 

@@ -47,6 +47,12 @@ class Tally:
         """Classes that occur in the truth or the prediction; the mean is over these."""
         return self.tp + self.fp + self.fn > 0
 
+    @property
+    def pq(self) -> float:
+        """Mean PQ over the classes that occur, in percent; NaN where none does."""
+        present = self.present
+        return float(100 * self.quality()[present, 0].mean()) if present.any() else float("nan")
+
     def quality(self) -> NDArray[np.float64]:
         """[C,3] PQ, SQ and RQ in [0, 1]; 0 for absent classes."""
         halves = np.maximum(self.tp + 0.5 * self.fp + 0.5 * self.fn, 0.5)
@@ -109,10 +115,16 @@ class PanopticQuality:
         self.labels = labels
         self.tally = Tally.zero(IGNORE)
 
-    def update(self, predicted_ids_HW: NDArray, true_ids_HW: NDArray) -> None:
-        """Add an image: maps of Cityscapes' instance ids (labelId, or labelId * 1000 + number)."""
+    def update(self, predicted_ids_HW: NDArray, true_ids_HW: NDArray) -> Tally:
+        """Add an image: maps of Cityscapes' instance ids (labelId, or labelId * 1000 + number).
+
+        Returns:
+            The image's own matches.
+        """
         predicted = segments(predicted_ids_HW, self.labels)
-        self.tally += match(predicted, segments(true_ids_HW, self.labels), IGNORE)
+        own = match(predicted, segments(true_ids_HW, self.labels), IGNORE)
+        self.tally += own
+        return own
 
     def compute(self) -> dict:
         """pq, sq, rq, then pq_things and pq_stuff, and per class the three with tp, fp and fn.

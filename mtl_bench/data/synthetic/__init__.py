@@ -1,4 +1,4 @@
-"""The built-in data set: procedural street scenes as short videos, in Cityscapes' file layout.
+"""The built-in data set: procedural street scenes as videos, in Cityscapes' layout or KITTI's.
 
 `ensure` renders it into the user's cache on first use, `write` into a folder of choice. Scenes are
 rendered by worker processes (`python -m mtl_bench.data.synthetic`); every scene depends on the seed
@@ -16,7 +16,8 @@ from pathlib import Path
 import platformdirs
 
 from mtl_bench.config import Data
-from mtl_bench.data.synthetic.files import Settings
+from mtl_bench.data.layouts import CITYSCAPES, LAYOUTS
+from mtl_bench.data.synthetic.settings import Settings
 from mtl_bench.data.synthetic.workers import render_all
 
 __all__ = ["ensure", "write"]
@@ -26,12 +27,12 @@ def ensure(data: Data, root: Path | None = None, progress: bool = True) -> Path:
     """The rendered data set that a recipe asks for; rendered now if it is not there yet.
 
     Args:
-        data: size, numbers of scenes, length of a snippet and seed.
+        data: name, which says the layout, size, numbers of scenes, length of a snippet and seed.
         root: folder that holds rendered data sets; None = the user's cache folder.
         progress: show progress on stderr.
 
     Returns:
-        The data set's folder, laid out like Cityscapes'.
+        The data set's folder.
 
     Raises:
         ValueError: snippets too short to train on, or sizes or counts that cannot be rendered.
@@ -41,11 +42,11 @@ def ensure(data: Data, root: Path | None = None, progress: bool = True) -> Path:
             f"recipe.data.frames = {data.frames}, but training compares a frame with the one "
             f"before it and the one after it; set 3 or more"
         )
-    settings = _settings(
-        data.height, data.width, data.train_scenes, data.val_scenes, 8, data.seed, data.frames
-    )
+    counts = data.train_scenes, data.val_scenes, data.test_scenes
+    layout = LAYOUTS[data.dataset]
+    settings = _settings(data.height, data.width, *counts, data.seed, data.frames, layout=layout)
     root = platformdirs.user_cache_path("mtl-bench") if root is None else Path(root)
-    out = root / f"synthetic-{data.height}x{data.width}-{settings.key}"
+    out = root / f"{data.dataset}-{data.height}x{data.width}-{settings.key}"
     if not out.is_dir():
         with _lock(out):
             if not out.is_dir():  # another process may have been at it while we waited
@@ -66,6 +67,7 @@ def write(
     min_instance_area: int | None = None,
     processes: int | None = None,
     progress: bool = True,
+    layout: str = CITYSCAPES,
 ) -> Path:
     """Render a data set into a new folder.
 
@@ -74,11 +76,12 @@ def write(
         height: pixels; the scenes are the same at every size.
         frames: length of a snippet; Cityscapes' have 30.
         annotated: index of the frame that has labels; None = 19 of 30 as in Cityscapes, else the
-            middle one.
+            middle one. In KITTI's layout all frames between the first and the last have them.
         min_instance_area: a thing of which fewer pixels are visible is written as a *group*, the
             bare label id (< 1000, `iscrowd`), as annotators do with what they cannot tell apart;
             None = 12 at 64x128, in proportion at other sizes.
         processes: workers; None = one a core.
+        layout: of files, one of `data.layouts`.
 
     Raises:
         ValueError: `out` exists, or sizes or counts that cannot be rendered.
@@ -93,6 +96,7 @@ def write(
         frames,
         annotated,
         min_instance_area,
+        layout,
     )
     out = Path(out)
     with _lock(out):
@@ -112,12 +116,15 @@ def _settings(
     frames: int,
     annotated: int | None = None,
     min_area: int | None = None,
+    layout: str = CITYSCAPES,
 ) -> Settings:
     if annotated is None:
         annotated = 19 if frames == 30 else frames // 2
     if min_area is None:
         min_area = max(1, round(12 * height * width / (64 * 128)))
-    return Settings(height, width, train, val, test, seed, frames, annotated, min_area)
+    return Settings(
+        height, width, train, val, test, seed, frames, annotated, min_area, layout=layout
+    )
 
 
 def _render(out: Path, settings: Settings, processes: int | None, progress: bool) -> None:

@@ -28,6 +28,7 @@ class Camera:
     u0: float
     v0: float
     mount_m: float  # above the road
+    level: bool = False  # mounted without pitch: only the suspension adds some
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def draw_motion(rng: np.random.Generator, camera: Camera, frames: int, annotated
     heading, base_pitch = rng.normal(0, 0.015), rng.normal(0.012, 0.008)
     steps_m = step_m * (1 + rng.normal(0, 0.02, frames))
     yaws = heading + yaw_step * (np.arange(frames) - annotated) + rng.normal(0, 0.0004, frames)
-    pitches = base_pitch + rng.normal(0, 0.0008, frames)
+    pitches = (0 if camera.level else base_pitch) + rng.normal(0, 0.0008, frames)
     along = np.cumsum(
         np.stack([np.sin(yaws), np.zeros(frames), np.cos(yaws)], 1) * steps_m[:, None], 0
     )

@@ -5,13 +5,10 @@ snippet, leftImg8bit_sequence; gtFine (instanceIds, labelIds, panoptic), dispari
 Beyond Cityscapes, `egomotion/` holds the exact relative camera poses.
 """
 
-import hashlib
 import json
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,10 +20,9 @@ from mtl_bench.data.synthetic.camera import (
     FloatArray,
     context_from_target,
 )
+from mtl_bench.data.synthetic.settings import SPLITS, Settings, write_png, write_record
 
-SPLITS = ("train", "val", "test")
 _CITY_SCENES = 50
-_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 2]
 _SUPERCATEGORIES = (
     "flat", "flat", "construction", "construction", "construction", "object", "object", "object",
     "nature", "nature", "sky", "human", "human", *["vehicle"] * 6,
@@ -44,54 +40,6 @@ _CATEGORIES = [
 _EVALUATED = {label.label_id: label for label in CITYSCAPES19.labels}
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What the bytes of a data set depend on."""
-
-    height: int
-    width: int
-    train_scenes: int
-    val_scenes: int
-    test_scenes: int
-    seed: int
-    frames: int
-    annotated: int  # index of the frame that has labels
-    min_instance_area: int  # visible pixels below which a thing is written as a group
-    renderer_version: int = render.RENDERER_VERSION
-
-    def __post_init__(self) -> None:
-        """Raises: ValueError: sizes or counts that cannot be rendered."""
-        if self.height < 16 or self.width < 16:
-            raise ValueError(
-                f"{self.height}x{self.width} is too small to render; use 16x16 or more"
-            )
-        if not 0 <= self.annotated < self.frames:
-            raise ValueError(f"annotated frame {self.annotated} is not among {self.frames} frames")
-        if min(self.counts) < 0 or sum(self.counts) == 0:
-            raise ValueError(
-                f"cannot render {self.counts} scenes; give counts >= 0, one of them > 0"
-            )
-
-    @property
-    def counts(self) -> tuple[int, int, int]:
-        return self.train_scenes, self.val_scenes, self.test_scenes
-
-    @property
-    def scenes(self) -> list[tuple[int, int]]:
-        """(split, scene) of all scenes in a fixed order."""
-        return [(split, i) for split, count in enumerate(self.counts) for i in range(count)]
-
-    @property
-    def key(self) -> str:
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:12]
-
-    def place(self, split: int, scene: int) -> tuple[str, str]:
-        """City and `<city>_<sequence>`; no city has scenes of two splits."""
-        before = sum(-(-count // _CITY_SCENES) for count in self.counts[:split])
-        city = f"syn{before + scene // _CITY_SCENES:02d}"
-        return city, f"{city}_{scene % _CITY_SCENES:06d}"
-
-
 def encode_disparity(
     depth_m: FloatArray, fx: float, baseline_m: float = BASELINE_M
 ) -> NDArray[np.uint16]:
@@ -104,6 +52,13 @@ def encode_disparity(
     return np.where(valid & (steps > 0) & (steps < 65535), steps + 1, 0).astype(np.uint16)
 
 
+def place(settings: Settings, split: int, scene: int) -> tuple[str, str]:
+    """City and `<city>_<sequence>`; no city has scenes of two splits."""
+    before = sum(-(-count // _CITY_SCENES) for count in settings.counts[:split])
+    city = f"syn{before + scene // _CITY_SCENES:02d}"
+    return city, f"{city}_{scene % _CITY_SCENES:06d}"
+
+
 def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict[str, Any]:
     """Render and write one scene; returns its entries of the split's panoptic JSON."""
     scene = render.draw_scene(
@@ -114,7 +69,7 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
         settings.annotated,
     )
     name = SPLITS[split]
-    city, stem = settings.place(split, number)
+    city, stem = place(settings, split, number)
 
     def path(kind: str, frame: int, ending: str) -> Path:
         folder = root / kind / name / city
@@ -124,15 +79,15 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
     target = settings.annotated
     for frame in range(settings.frames):
         image = render.image(scene, frame)
-        _write_png(path("leftImg8bit_sequence", frame, "leftImg8bit.png"), image)
+        write_png(path("leftImg8bit_sequence", frame, "leftImg8bit.png"), image)
         if frame == target:
-            _write_png(path("leftImg8bit", frame, "leftImg8bit.png"), image)
+            write_png(path("leftImg8bit", frame, "leftImg8bit.png"), image)
     seen = render.truth(scene, target)
     ids = render.instance_ids(seen, settings.min_instance_area)
-    _write_png(path("gtFine", target, "gtFine_instanceIds.png"), ids)
-    _write_png(path("gtFine", target, "gtFine_labelIds.png"), seen.label_HW)
+    write_png(path("gtFine", target, "gtFine_instanceIds.png"), ids)
+    write_png(path("gtFine", target, "gtFine_labelIds.png"), seen.label_HW)
     disparity = encode_disparity(seen.depth_HW, scene.camera.fx)
-    _write_png(path("disparity", target, "disparity.png"), disparity)
+    write_png(path("disparity", target, "disparity.png"), disparity)
     for kind, values in (
         ("camera", _camera(scene)),
         ("vehicle", _vehicle(scene)),
@@ -144,7 +99,7 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
     picture, entries = panoptic(ids, image_id)
     folder = root / "gtFine" / f"cityscapes_panoptic_{name}"
     folder.mkdir(parents=True, exist_ok=True)
-    _write_png(folder / f"{image_id}_gtFine_panoptic.png", picture)
+    write_png(folder / f"{image_id}_gtFine_panoptic.png", picture)
     return {"split": split, "sort": f"{city}/{stem}", **entries}
 
 
@@ -190,12 +145,7 @@ def write_summary(root: Path, settings: Settings, entries: list[dict[str, Any]])
             }
             text = json.dumps(content, sort_keys=True, indent=4)
             (root / "gtFine" / f"cityscapes_panoptic_{name}.json").write_text(text)
-    (root / "synthetic.json").write_text(json.dumps(asdict(settings), indent=4) + "\n")
-
-
-def _write_png(path: Path, image: NDArray) -> None:
-    if not cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, _FAST):
-        raise OSError(f"cannot write {path}")
+    write_record(root, settings)
 
 
 def _camera(scene: render.Scene) -> dict[str, dict[str, float]]:

@@ -43,9 +43,7 @@ class Scene:
     markings: Markings
     shadows_S7: FloatArray
     light: shade.Light
-    bonnet: tuple[
-        float, float, float
-    ]  # edge in the middle and drop to the sides (of H), shift (of W)
+    bonnet: tuple[float, float, float] | None  # edge, its drop to the sides (of H), shift (of W)
     bonnet_color_3: FloatArray
 
     def viewer(self, frame: int) -> Pose:
@@ -71,11 +69,21 @@ class Truth:
 
 
 def draw_scene(
-    seed: tuple[int, ...], height: int, width: int, frames: int, annotated: int
+    seed: tuple[int, ...],
+    height: int,
+    width: int,
+    frames: int,
+    annotated: int,
+    camera: Camera | None = None,
 ) -> Scene:
-    """The street of one seed; the same street at every size."""
+    """The street of one seed; the same street at every size.
+
+    Args:
+        camera: mounted on the roof; None: drawn, behind the windscreen, and sees the bonnet.
+    """
     rng = np.random.default_rng(np.random.SeedSequence(seed))
-    camera = draw_camera(rng, height, width)
+    on_roof = camera is not None
+    camera = camera or draw_camera(rng, height, width)
     motion = draw_motion(np.random.default_rng([*seed, 1]), camera, frames, annotated)
     light = shade.draw_light(rng)
     bonnet = (rng.uniform(0.9, 0.955), rng.uniform(0.02, 0.07), rng.uniform(-0.03, 0.03))
@@ -85,7 +93,8 @@ def draw_scene(
     shadows = traffic.populate(rng, place, motion.step_m)
     return Scene(
         camera, motion, annotated, place.collector.solids(), place.markings,
-        np.array(shadows, np.float32).reshape(-1, 7), light, bonnet, color.clip(0.03, 0.6),
+        np.array(shadows, np.float32).reshape(-1, 7), light, None if on_roof else bonnet,
+        color.clip(0.03, 0.6),
     )  # fmt: skip
 
 
@@ -95,7 +104,8 @@ def truth(scene: Scene, frame: int) -> Truth:
     time = frame - scene.annotated
     u, v = _centres(camera)
     depth, index = cast(solids, camera, scene.motion.poses[frame], time, u, v)
-    index[_bonnet(scene, u, v) >= 0] = -2
+    if scene.bonnet is not None:
+        index[_bonnet(scene.bonnet, camera, u, v) >= 0] = -2
     label = solids.label_P[index].astype(np.uint8)
     label[index == -1], label[index == -2] = SKY, EGO
     things = np.where(index >= 0, solids.object_P[index], 0)
@@ -154,7 +164,8 @@ def radiance(scene: Scene, frame: int) -> FloatArray:
             scene, frame, us, vs, blocks[rows, cols].ravel() >> 2, depths[rows, cols].ravel()
         )
         out[rows, cols] = four.reshape(-1, 4, 3).mean(1)
-    _draw_bonnet(scene, out, u, v)
+    if scene.bonnet is not None:
+        _draw_bonnet(scene, out, _bonnet(scene.bonnet, camera, u, v))
     toned: FloatArray = np.clip(out, 0, 1) ** np.float32(0.9)
     return toned
 
@@ -223,17 +234,17 @@ def _colors(
     return out
 
 
-def _bonnet(scene: Scene, u: FloatArray, v: FloatArray) -> FloatArray:
+def _bonnet(
+    bonnet: tuple[float, float, float], camera: Camera, u: FloatArray, v: FloatArray
+) -> FloatArray:
     """How far [H,W] below the bonnet's edge a pixel centre lies, in pixels; in every frame."""
-    top, drop, shift = scene.bonnet
-    height, width = scene.camera.height, scene.camera.width
-    across = (u / width - 0.5 - shift) * 2
-    return v[:, None] - (top + drop * across[None] ** 2) * height
+    top, drop, shift = bonnet
+    across = (u / camera.width - 0.5 - shift) * 2
+    return v[:, None] - (top + drop * across[None] ** 2) * camera.height
 
 
-def _draw_bonnet(scene: Scene, out: FloatArray, u: FloatArray, v: FloatArray) -> None:
+def _draw_bonnet(scene: Scene, out: FloatArray, below: FloatArray) -> None:
     """Smooth paint that mirrors a little sky; its edge is anti-aliased, its mask is not."""
-    below = _bonnet(scene, u, v)
     share = np.clip(below + 0.5, 0, 1)[..., None]
     gloss = np.exp(-np.maximum(below, 0) / (0.03 * scene.camera.height))[..., None] * np.float32(
         0.35

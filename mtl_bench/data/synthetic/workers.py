@@ -14,12 +14,17 @@ import threading
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mtl_bench.data.synthetic.files import Settings, write_scene, write_summary
+from mtl_bench.data.layouts import CITYSCAPES, KITTI
+from mtl_bench.data.synthetic import files, kitti_layout
+from mtl_bench.data.synthetic.settings import Settings
+
+_WRITERS: dict[str, ModuleType] = {CITYSCAPES: files, KITTI: kitti_layout}
 
 _SINGLE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -35,13 +40,14 @@ def render_all(root: Path, settings: Settings, processes: int | None, progress: 
     count = max(1, min(processes or cores or 1, total))
     lines = _own(root, settings) if count == 1 else _children(root, settings, count)
     entries = list(_shown(lines, total, settings) if progress else lines)
-    write_summary(root, settings, entries)
+    _WRITERS[settings.layout].write_summary(root, settings, entries)
 
 
 def work() -> None:
     """Main function of a worker: argv is the JSON job that `_children` makes."""
     job = json.loads(sys.argv[1])
     settings = Settings(**job["settings"])
+    write_scene = _WRITERS[settings.layout].write_scene
     for split, scene in settings.scenes[job["first"] :: job["step"]]:
         line = json.dumps(write_scene(Path(job["root"]), settings, split, scene))
         try:
@@ -52,7 +58,7 @@ def work() -> None:
 
 def _own(root: Path, settings: Settings) -> Iterator[dict[str, Any]]:
     for split, scene in settings.scenes:
-        yield write_scene(root, settings, split, scene)
+        yield _WRITERS[settings.layout].write_scene(root, settings, split, scene)
 
 
 def _children(root: Path, settings: Settings, count: int) -> Iterator[dict[str, Any]]:

@@ -1,0 +1,263 @@
+"""KITTI raw as samples, on the Eigen-Zhou split or on all of a tree's frames.
+
+What samples hold is as for Cityscapes. Frames differ in size from day to day by up to 2 %: all are
+resized to the recipe's input, each axis by its own factor, intrinsics and labels with them (MGNet
+keeps the shape and pads to 384 x 1280 instead). Ground truth stays at the frame's own size.
+"""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mtl_bench import config
+from mtl_bench.data import frame_cache, velodyne
+from mtl_bench.data import kitti_files as files
+from mtl_bench.data import kitti_splits as splits
+from mtl_bench.data.augment import scale
+from mtl_bench.data.cityscapes import _PLAIN, Cityscapes, _Frame
+from mtl_bench.data.cityscapes_files import check_same_size, read_instance_ids
+from mtl_bench.data.frame_cache import FrameCache, Source
+from mtl_bench.data.kitti_splits import Frame
+from mtl_bench.data.labels import CITYSCAPES19, LabelSet
+
+# Which depth maps a frame may have, the first that exists wins
+TRUTHS = {
+    "default": ("improved", "velodyne"),
+    "improved": ("improved",),
+    "velodyne": ("velodyne",),
+}
+PSEUDO_LABEL = "mtl-bench pseudo-label --checkpoint CITYSCAPES_RUN --data"
+
+
+class Kitti(Cityscapes):
+    """One split: those of its frames that the tree has.
+
+    Label files, which `mtl-bench pseudo-label` writes, are training targets and mask the sky. They
+    are ground truth too where they are no network's: in the built-in data.
+
+    Args:
+        root: the folder that holds 2011_09_26, ...
+        split: train, val or test. Training frames need both neighbours: others are left out.
+        data: input size, and by `train_frames` whether the published frames train or all that
+            neither val nor test has.
+        labels: the classes.
+        video: the depth task: neighbours in training, depth maps in evaluation.
+        panoptic: the panoptic task: training frames must have labels. Without it they only mask
+            the reprojection, where they exist.
+        augment: random changes of training samples; None for a split that is only evaluated.
+        loss: what the targets depend on.
+        truth: depth maps to evaluate on: `improved`, `velodyne` (projected scans), or `default`,
+            improved where a frame has one, else velodyne. Frames without are left out.
+
+    Attributes:
+        published_frames: how many the split has as published, with this truth.
+        left_out: frames of the split that are not in use, by why.
+        truths: frames in use by their depth map's kind.
+
+    Raises:
+        ValueError: no frame of the split is there, or frames lack labels or calibration.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        split: str,
+        data: config.Data,
+        labels: LabelSet = CITYSCAPES19,
+        *,
+        video: bool,
+        panoptic: bool,
+        augment: config.Augment | None,
+        loss: config.Loss,
+        truth: str = "default",
+    ) -> None:
+        self.root, self.split, self.data, self.labels = root, split, data, labels
+        self.video, self.panoptic, self.loss = video, panoptic, loss
+        self._augment, self._ego_mask = augment or _PLAIN, None
+        self._cache: dict[tuple[int, bool], _Frame] | None = {} if data.cache else None
+        self.on_disk = FrameCache(root, data, self._to_input)
+        self.tree = files.Tree(root)
+        self.left_out: Counter[str] = Counter()
+        frames = self._present()
+        if video and augment is None:
+            frames = self._with_truth(frames, truth)
+        self._frames = {frame.name: frame for frame in frames}
+        self.names = list(self._frames)
+        self._label_files = {
+            frame.name: self.tree.labels(frame) for frame in frames if self.tree.has_labels(frame)
+        }
+        if panoptic and augment is not None:
+            self._require_labels()
+        self._cameras = {
+            (date, camera): files.read_camera(root / date, camera)
+            for date, camera in {(frame.date, frame.camera) for frame in frames}
+        }
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a row says of the frames: how many of the published ones, and the truth's kinds."""
+        of_all = self.split == "train" and self.data.train_frames == "all"
+        return {
+            "frames": len(self),
+            "frames_published": None if of_all else self.published_frames,
+            **({"left_out": dict(self.left_out)} if self.left_out else {}),
+            **({"depth_truth": dict(self.truths)} if self.truths else {}),
+        }
+
+    def sources(self, training: bool) -> list[Source]:
+        """The files that samples are made of and that `on_disk` can hold."""
+        frames = set(self._frames.values())
+        if training and self.video:
+            frames |= {frame.later(step) for frame in frames for step in (-1, 1)}
+        sources = [(self.tree.image(frame), frame_cache.IMAGE) for frame in sorted(frames)]
+        labels = [(path, frame_cache.LABELS) for path in self._label_files.values() if training]
+        return sources + labels
+
+    # --- which frames -----------------------------------------------------------------------------
+
+    def _present(self) -> list[Frame]:
+        """The split's frames that are there, in training with both neighbours."""
+        self.truths: Counter[str] = Counter()
+        wanted = splits.frames_of(self.root, self.split)
+        self.published_frames = len(wanted)
+        choice = self.data.train_frames
+        if choice not in ("published", "all"):
+            raise ValueError(f"recipe.data.train_frames must be published or all, not '{choice}'")
+        if self.split == "train" and choice == "all":
+            present = self._of_no_list("val", "test")
+        else:
+            present = [frame for frame in wanted if self.tree.has_image(frame)]
+            self._leave_out("absent", len(wanted) - len(present))
+        frames = present
+        if self.split == "train":
+            frames = [frame for frame in present if self.tree.has_neighbours(frame)]
+            self._leave_out("without neighbours", len(present) - len(frames))
+        if not frames:
+            raise ValueError(self._nothing(choice))
+        return frames
+
+    def _of_no_list(self, *others: str) -> list[Frame]:
+        kept = {frame for split in others for frame in splits.frames_of(self.root, split)}
+        return [frame for frame in self.tree.frames() if frame not in kept]
+
+    def _leave_out(self, why: str, count: int) -> None:
+        if count:
+            self.left_out[why] = count
+
+    def _nothing(self, choice: str) -> str:
+        see = f"see 'mtl-bench data check {self.root}'"
+        if self.split == "train" and choice == "all":
+            return f"{self.root}: no frame to train on that has both neighbours; {see}"
+        advice = f"unpack the drives that have them, {see}"
+        if self.split == "train":
+            advice += ", or set recipe.data.train_frames=all to train on what is there"
+        count = self.published_frames
+        return f"{self.root}: none of the {count} frames of the split {self.split}; {advice}"
+
+    def _with_truth(self, frames: list[Frame], truth: str) -> list[Frame]:
+        if truth not in TRUTHS:
+            raise ValueError(f"KITTI has no depth truth '{truth}': it has {', '.join(TRUTHS)}")
+        if truth == "improved":
+            listed = splits.frames_of(self.root, self.split)
+            self.published_frames -= len(splits.without_improved().intersection(listed))
+        has = {"improved": self.tree.has_improved, "velodyne": self.tree.has_scan}
+        found = {
+            frame: next((kind for kind in TRUTHS[truth] if has[kind](frame)), None)
+            for frame in frames
+        }
+        self._truth = {frame: kind for frame, kind in found.items() if kind}
+        self.truths = Counter(self._truth.values())
+        self._leave_out("without depth maps", len(frames) - len(self._truth))
+        if not self._truth:
+            wanted = " or ".join(TRUTHS[truth])
+            raise ValueError(
+                f"{self.root}: none of its {len(frames)} frames of {self.split} has a depth map "
+                f"({wanted}); unpack {files.DEPTH_PACKAGE}.zip into it, or the drives' "
+                f"velodyne_points"
+            )
+        return list(self._truth)
+
+    def _require_labels(self) -> None:
+        missing = [name for name in self.names if name not in self._label_files]
+        if missing:
+            raise ValueError(
+                f"{self.tree.labels(self._frames[missing[0]])}: missing, one of {len(missing)} "
+                f"label files that the panoptic task needs; make them with "
+                f"'{PSEUDO_LABEL} {self.root}'"
+            )
+
+    # --- decoding ---------------------------------------------------------------------------------
+
+    def _read(self, name: str, training: bool) -> _Frame:
+        frame = self._frames[name]
+        path = self.tree.image(frame)
+        camera = self._cameras[frame.date, frame.camera]
+        images = [self.on_disk.read(path, frame_cache.IMAGE)]
+        check_calibrated(path, images[0].own_size, camera)
+        size = camera.size
+        if training and self.video:
+            around = [self.tree.image(frame.later(step)) for step in (-1, 1)]
+            whole = (path, size)
+            images += [self.on_disk.read(beside, frame_cache.IMAGE, whole) for beside in around]
+        ids = self._read_labels(frame, path, size, training)
+        depth_m = self._read_depth_m(frame, path, camera) if self.video and not training else None
+        K_33 = torch.from_numpy(camera.K_33).float()
+        return _Frame(
+            images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
+            K_33=scale(K_33, self.data.width / size[1], self.data.height / size[0]),
+            camera_height_m=files.CAMERA_HEIGHT_M,
+            camera_pitch_rad=0.0,
+            instance_ids=None if ids is None else torch.from_numpy(ids.astype(np.int32)),
+            depth_m=None if depth_m is None else torch.from_numpy(depth_m),
+        )
+
+    def _read_labels(
+        self, frame: Frame, path: Path, size: tuple[int, int], training: bool
+    ) -> NDArray[np.uint16] | None:
+        """At the input's size in training; in evaluation only true ones, which all frames have."""
+        true = len(self._label_files) == len(self) and not self.tree.predicted_labels
+        if frame.name not in self._label_files or not (training or true):
+            return None
+        label_path = self._label_files[frame.name]
+        if training:
+            return self.on_disk.read(label_path, frame_cache.LABELS, (path, size)).pixels
+        ids = read_instance_ids(label_path)
+        check_same_size(label_path, ids.shape, path, size)
+        return ids
+
+    def _read_depth_m(self, frame: Frame, path: Path, camera: files.Camera) -> NDArray[np.float32]:
+        if self._truth[frame] == "velodyne":
+            project_34 = files.scanner_to_pixels(self.root / frame.date, camera)
+            return velodyne.depth_map(
+                velodyne.read_scan(self.tree.scan(frame)), project_34, camera.size
+            )
+        depth_path = self.tree.improved(frame)
+        depth_m = files.read_improved_m(depth_path)
+        check_same_size(depth_path, depth_m.shape, path, camera.size)
+        return depth_m
+
+    def _to_input(self, array: NDArray, path: Path, interpolation: int) -> NDArray:
+        return to_size(array, self.data.height, self.data.width, interpolation)
+
+
+def to_size(array: NDArray, height: int, width: int, interpolation: int) -> NDArray:
+    """[height,width,...]; area means, where they are asked for, turn bilinear when they enlarge."""
+    if array.shape[:2] == (height, width):
+        return array
+    if interpolation == cv2.INTER_AREA and (height > array.shape[0] or width > array.shape[1]):
+        interpolation = cv2.INTER_LINEAR
+    return cv2.resize(array, (width, height), interpolation=interpolation)
+
+
+def check_calibrated(path: Path, size: tuple[int, ...], camera: files.Camera) -> None:
+    """Raises: ValueError where an image has not the size that its day's calibration is for."""
+    if tuple(size) != camera.size:
+        raise ValueError(
+            f"{path}: {size[0]}x{size[1]} pixels, but the day's calibration is for "
+            f"{camera.size[0]}x{camera.size[1]}; use KITTI's rectified images (sync) unchanged"
+        )

@@ -1,0 +1,221 @@
+"""KITTI raw on disk: where each file lies and what it says, in NumPy.
+
+    <date>/calib_cam_to_cam.txt, calib_velo_to_cam.txt
+    <date>/<drive>/image_02|03/data/<10 digits>.png             8-bit RGB; 02 left, 03 right
+    <date>/<drive>/velodyne_points/data/<10 digits>.bin
+    <date>/<drive>/label_02|03/data/<10 digits>.png             16-bit instance ids, ours
+
+The improved depth maps (Uhrig et al., 3DV 2017), `<drive>/proj_depth/groundtruth/image_02/*.png`,
+lie under `<date>/`, or as their own package has them: under `train/` and `val/`, in the root or
+beside it, in a folder `data_depth_annotated` or not. Every error is a ValueError of one line.
+"""
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtl_bench.data import png
+from mtl_bench.data.kitti_splits import CAMERAS, Frame
+from mtl_bench.data.layouts import is_date
+
+CAMERA_HEIGHT_M = 1.65  # of every drive, above the ground (Geiger et al., IJRR 2013)
+RECORD = "pseudo_labels.json"  # in the root where the labels are a network's
+DEPTH_PACKAGE = "data_depth_annotated"
+_CALIBRATION, _SCANNER = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
+
+
+class Tree:
+    """What is there: every folder is listed once, and no file opened.
+
+    Args:
+        labels: where the label files are, in place of the root.
+
+    Raises:
+        ValueError: no such folder, or no day of recording in it.
+    """
+
+    def __init__(self, root: Path, labels: Path | None = None) -> None:
+        if not root.is_dir():
+            raise ValueError(f"{root}: no such folder; --data takes the folder of KITTI's days")
+        self.root, self._labels_root = root, labels or root
+        self.dates = sorted(path.name for path in root.iterdir() if is_date(path.name))
+        if not self.dates:
+            raise ValueError(
+                f"{root}: no day such as 2011_09_26 in it; expected KITTI raw's layout, "
+                f"<date>/<drive>/image_02/data/"
+            )
+        self._numbers: dict[tuple[str, str, str], frozenset[int]] = {}
+        self._improved: dict[tuple[str, str], Path] = {}
+        packages = [base / name for base in (root, root.parent) for name in ("", DEPTH_PACKAGE)]
+        self._depth_roots = [base / half for base in packages for half in ("train", "val")]
+
+    # --- places -----------------------------------------------------------------------------------
+
+    def _in_drive(self, frame: Frame, folder: str, suffix: str = ".png") -> Path:
+        drive = self.root / frame.date / frame.drive
+        return drive / folder / "data" / f"{frame.number:010d}{suffix}"
+
+    def image(self, frame: Frame) -> Path:
+        return self._in_drive(frame, f"image_{frame.camera}")
+
+    def labels(self, frame: Frame) -> Path:
+        path = self._in_drive(frame, f"label_{frame.camera}")
+        return self._labels_root / path.relative_to(self.root)
+
+    def scan(self, frame: Frame) -> Path:
+        return self._in_drive(frame, "velodyne_points", ".bin")
+
+    def improved(self, frame: Frame) -> Path:
+        """In the first folder of its layouts that there is, else where it is looked for first."""
+        key = frame.drive, frame.camera
+        if key not in self._improved:
+            inner = Path(frame.drive, "proj_depth", "groundtruth", f"image_{frame.camera}")
+            folders = [base / inner for base in (self.root / frame.date, *self._depth_roots)]
+            self._improved[key] = next((path for path in folders if path.is_dir()), folders[0])
+        return self._improved[key] / f"{frame.number:010d}.png"
+
+    # --- what is there ----------------------------------------------------------------------------
+
+    def _has(self, frame: Frame, path_of: Callable[[Frame], Path]) -> bool:
+        key = path_of.__name__, frame.drive, frame.camera
+        if key not in self._numbers:
+            path = path_of(frame)
+            self._numbers[key] = _numbers_in(path.parent, path.suffix)
+        return frame.number in self._numbers[key]
+
+    def has_image(self, frame: Frame) -> bool:
+        return self._has(frame, self.image)
+
+    def has_labels(self, frame: Frame) -> bool:
+        return self._has(frame, self.labels)
+
+    def has_scan(self, frame: Frame) -> bool:
+        return self._has(frame, self.scan)
+
+    def has_improved(self, frame: Frame) -> bool:
+        return self._has(frame, self.improved)
+
+    def has_neighbours(self, frame: Frame) -> bool:
+        return all(self.has_image(frame.later(step)) for step in (-1, 1))
+
+    @property
+    def predicted_labels(self) -> bool:
+        """Whether the label files are a network's, which nothing may be measured against."""
+        return (self.root / RECORD).is_file()
+
+    def drives(self) -> list[str]:
+        """Names of the drives' folders, in order."""
+        folders = (path for date in self.dates for path in (self.root / date).iterdir())
+        return sorted(path.name for path in folders if path.is_dir())
+
+    def frames(self) -> Iterator[Frame]:
+        """Every frame that has an image, in order."""
+        for drive in self.drives():
+            for camera in CAMERAS.values():
+                path = self.image(Frame(drive, camera, 0))
+                for number in sorted(_numbers_in(path.parent, path.suffix)):
+                    yield Frame(drive, camera, number)
+
+
+def _numbers_in(folder: Path, suffix: str) -> frozenset[int]:
+    if not folder.is_dir():
+        return frozenset()
+    try:
+        with os.scandir(folder) as entries:  # 95k names in all: Path objects would take seconds
+            names = [entry.name for entry in entries if entry.name.endswith(suffix)]
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be listed ({error.strerror})") from error
+    stems = [name.removesuffix(suffix) for name in names]
+    return frozenset(int(stem) for stem in stems if len(stem) == 10 and stem.isdigit())
+
+
+# --- calibration ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One rectified camera of a day."""
+
+    P_34: NDArray[np.float64]  # from the rectified axes of camera 00 to this one's pixels
+    R_33: NDArray[np.float64]  # from camera 00's own axes to the rectified ones
+    size: tuple[int, int]  # of its images: height, width
+
+    @property
+    def K_33(self) -> NDArray[np.float64]:
+        return self.P_34[:, :3]
+
+
+def read_camera(date_folder: Path, camera: str) -> Camera:
+    """The day's `P_rect`, `R_rect_00` and `S_rect`.
+
+    Raises:
+        ValueError: the file is missing or lacks one of them, or a focal length is impossible.
+    """
+    path = date_folder / _CALIBRATION
+    values = _read_values(path)
+    P_34 = _matrix(path, values, f"P_rect_{camera}", (3, 4))
+    width, height = _matrix(path, values, f"S_rect_{camera}", (2,))
+    if min(P_34[0, 0], P_34[1, 1]) <= 0:
+        raise ValueError(f"{path}: impossible focal length in P_rect_{camera}")
+    R_33 = _matrix(path, values, "R_rect_00", (3, 3))
+    return Camera(P_34, R_33, (int(height), int(width)))
+
+
+def baseline_m(date_folder: Path) -> float:
+    """Distance between the two colour cameras."""
+    left, right = (read_camera(date_folder, camera).P_34 for camera in CAMERAS.values())
+    return float((left[0, 3] - right[0, 3]) / left[0, 0])
+
+
+def scanner_to_pixels(date_folder: Path, camera: Camera) -> NDArray[np.float64]:
+    """[3,4] projection of the scanner's points into a camera's image.
+
+    Raises:
+        ValueError: the scanner's calibration is missing or lacks R or T.
+    """
+    path = date_folder / _SCANNER
+    values = _read_values(path)
+    to_camera_44, rectify_44 = np.eye(4), np.eye(4)
+    to_camera_44[:3, :3] = _matrix(path, values, "R", (3, 3))
+    to_camera_44[:3, 3] = _matrix(path, values, "T", (3,))
+    rectify_44[:3, :3] = camera.R_33
+    return camera.P_34 @ rectify_44 @ to_camera_44
+
+
+def _read_values(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        raise ValueError(f"{path}: missing; unpack {path.parent.name}_calib.zip")
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read ({error})") from error
+    return {key: text for key, _, text in (line.partition(":") for line in lines)}
+
+
+def _matrix(
+    path: Path, values: dict[str, str], key: str, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    try:
+        numbers = [float(word) for word in values[key].split()]
+    except KeyError:
+        raise ValueError(f"{path}: no {key} in this calibration") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {key} is not numbers ({error})") from None
+    if len(numbers) != math.prod(shape) or not all(map(math.isfinite, numbers)):
+        raise ValueError(
+            f"{path}: {key} has {len(numbers)} numbers, not {math.prod(shape)} finite ones"
+        )
+    return np.array(numbers).reshape(shape)
+
+
+# --- contents -------------------------------------------------------------------------------------
+
+
+def read_improved_m(path: Path) -> NDArray[np.float32]:
+    """[H,W] depth in metres, 0 = no value; the file stores 256 times that."""
+    return png.read(path, 16).astype(np.float32) / np.float32(256)

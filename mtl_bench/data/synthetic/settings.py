@@ -1,0 +1,77 @@
+"""What a rendered data set is made from: sizes, counts, a seed and a layout of files."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+from numpy.typing import NDArray
+
+from mtl_bench.data.layouts import CITYSCAPES
+from mtl_bench.data.synthetic import render
+
+SPLITS = ("train", "val", "test")
+_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 2]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the bytes of a data set depend on."""
+
+    height: int
+    width: int
+    train_scenes: int
+    val_scenes: int
+    test_scenes: int
+    seed: int
+    frames: int
+    annotated: int  # index of the frame that has labels
+    min_instance_area: int  # visible pixels below which a thing is written as a group
+    renderer_version: int = render.RENDERER_VERSION
+    layout: str = CITYSCAPES
+
+    def __post_init__(self) -> None:
+        """Raises: ValueError: sizes or counts that cannot be rendered."""
+        if self.height < 16 or self.width < 16:
+            raise ValueError(
+                f"{self.height}x{self.width} is too small to render; use 16x16 or more"
+            )
+        if not 0 <= self.annotated < self.frames:
+            raise ValueError(f"annotated frame {self.annotated} is not among {self.frames} frames")
+        if min(self.counts) < 0 or sum(self.counts) == 0:
+            raise ValueError(
+                f"cannot render {self.counts} scenes; give counts >= 0, one of them > 0"
+            )
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        return self.train_scenes, self.val_scenes, self.test_scenes
+
+    @property
+    def scenes(self) -> list[tuple[int, int]]:
+        """(split, scene) of all scenes in a fixed order."""
+        return [(split, i) for split, count in enumerate(self.counts) for i in range(count)]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """As they are written down; Cityscapes' layout, once the only one, is not named."""
+        values = asdict(self)
+        if self.layout == CITYSCAPES:
+            del values["layout"]
+        return values
+
+    @property
+    def key(self) -> str:
+        return hashlib.sha256(json.dumps(self.values, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def write_png(path: Path, image: NDArray) -> None:
+    if not cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, _FAST):
+        raise OSError(f"cannot write {path}")
+
+
+def write_record(root: Path, settings: Settings) -> None:
+    """What the data set was made from, beside it."""
+    (root / "synthetic.json").write_text(json.dumps(settings.values, indent=4) + "\n")

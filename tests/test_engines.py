@@ -1,0 +1,382 @@
+"""Engines: the same maps as the plain network's, said before a time; and a row whatever happens."""
+
+import itertools
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from small_networks import SIZE, images, model, subject
+from torch import Tensor, nn
+
+from mtl_bench import config, engines
+from mtl_bench.engines import agreement, roofline, timed
+from mtl_bench.engines.base import Maps, Setting
+from mtl_bench.engines.eager import Eager
+from mtl_bench.engines.folding import NORM, fold
+from mtl_bench.engines.graph import Body, strided
+from mtl_bench.engines.scene import Finished
+from mtl_bench.engines.upsample import Upsample
+
+CPU = torch.device("cpu")
+PLAN = timed.Plan(passes=4, seconds=None, batch=2, threads=1, compared=2)
+HERE = [n for n in engines.NAMES if n != "tensorrt" and engines.available(n) is None]
+
+
+def setting(precision: str = "fp32", batch: int = 1) -> Setting:
+    return Setting(batch, *SIZE, precision, CPU, 1)
+
+
+# --- folding --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "backbone", ["tiny", "resnet18", "mobilenetv3", "mnasnet", "efficientnet_lite0"]
+)
+def test_folding_leaves_no_norm_and_changes_nothing(backbone):
+    body = Body(model(backbone).net)
+    x_B3HW = torch.randn(1, 3, *SIZE)
+    with torch.no_grad():
+        expected = body(x_B3HW)
+        folded = fold(body, x_B3HW)
+        assert not [node for node in folded.graph.nodes if node.target is NORM]
+        for a, b in zip(folded(x_B3HW), expected, strict=True):
+            assert (a - b).abs().max() <= 1e-5 * b.abs().max()
+
+
+def test_folding_takes_a_convolutions_bias_in():
+    module = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)).eval()
+    module[1].running_mean.normal_()
+    x_B3HW = torch.randn(2, 3, 8, 8)
+    assert torch.allclose(fold(module, x_B3HW)(x_B3HW), module(x_B3HW), atol=1e-6)
+
+
+def test_a_convolution_that_others_read_is_not_folded():
+    class Twice(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.conv, self.norm = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
+            self.norm.running_mean.fill_(1)
+
+        def forward(self, x: Tensor) -> Tensor:
+            raw = self.conv(x)
+            return self.norm(raw) + raw
+
+    module = Twice().eval()
+    x_B3HW = torch.randn(1, 3, 8, 8)
+    assert torch.allclose(fold(module, x_B3HW)(x_B3HW), module(x_B3HW), atol=1e-6)
+
+
+def test_a_lower_precision_leaves_the_network_as_it_is():
+    net = model().net
+    before = {name: value.clone() for name, value in net.state_dict().items()}
+    strided(net, (1, *SIZE), torch.bfloat16)
+    for name, value in net.state_dict().items():
+        assert value.dtype == before[name].dtype
+        assert torch.equal(value, before[name]), name
+
+
+# --- classes of the full size ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("small", "large"),
+    [((8, 16), (64, 128)), ((5, 7), (33, 50)), ((2, 2), (9, 2)), ((16, 16), (16, 16))],
+)
+def test_classes_are_those_of_the_interpolated_logits(small, large):
+    torch.manual_seed(0)
+    logits_BChw = torch.randn(3, 6, *small)
+    upsample = Upsample(small, large, CPU)
+    expected = F.interpolate(logits_BChw, large, mode="bilinear", align_corners=True).argmax(1)
+    assert torch.equal(upsample.classes(logits_BChw), expected)
+
+
+def test_a_class_that_is_second_at_all_corners_can_be_first_between():
+    logits_1Chw = torch.tensor([[[[9.0, 0], [9, 0]], [[0, 9], [0, 9]], [[6, 6], [6, 6]]]])
+    found = Upsample((2, 2), (4, 9), CPU).classes(logits_1Chw)
+    assert found[0, 0].tolist() == [0, 0, 0, 2, 2, 2, 1, 1, 1]
+
+
+def test_chunks_leave_no_trace(monkeypatch):
+    torch.manual_seed(0)
+    logits_1Chw = torch.randn(1, 20, 8, 16)
+    whole = Upsample((8, 16), SIZE, CPU).classes(logits_1Chw)
+    monkeypatch.setattr("mtl_bench.engines.upsample.CHUNK", 1)
+    assert torch.equal(Upsample((8, 16), SIZE, CPU).classes(logits_1Chw), whole)
+
+
+# --- engines --------------------------------------------------------------------------------------
+
+
+AGREE = [(n, config.TASKS) for n in HERE if n != "compile"]
+AGREE += [("plain", ("depth",)), ("eager", ("depth",)), ("eager", ("panoptic",))]
+
+
+@pytest.mark.parametrize(("name", "tasks"), AGREE)
+def test_an_engine_agrees_with_plain(name, tasks):
+    what = subject("resnet18" if tasks == config.TASKS else "tiny", tasks)
+    with torch.inference_mode():
+        found = timed.compare(what, timed.make(what, name, setting()), images=2)
+    assert found.wrong("fp32") == ""
+    assert ("agreement.panoptic_equal" in found.values()) == ("panoptic" in tasks)
+    assert ("agreement.depth_median_rel" in found.values()) == ("depth" in tasks)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("compile" not in HERE, reason="no C++ compiler")
+def test_compile_agrees_with_plain():
+    with torch.inference_mode():
+        found = timed.compare(subject(), timed.make(subject(), "compile", setting()), images=2)
+    assert found.wrong("fp32") == ""
+
+
+@pytest.mark.parametrize("name", ["plain", "eager"])
+def test_a_batch_is_its_images(name):
+    what = subject()
+    with torch.inference_mode():
+        one, two = (timed.make(what, name, setting(batch=n)) for n in (1, 2))
+        batch = two.network(two.transfer(torch.cat(what.images[:2])))
+        for number, image in enumerate(what.images[:2]):
+            single = one.network(one.transfer(image))
+            assert torch.equal(batch.class_BHW[number], single.class_BHW[0])
+            assert torch.allclose(batch.inverse_B1HW[number], single.inverse_B1HW[0], atol=1e-4)
+
+
+def test_bf16_is_another_precision():
+    what = subject("resnet18")
+    with torch.inference_mode():
+        found = timed.compare(what, timed.make(what, "eager", setting("bf16")))
+    assert found.logits_max > 1e-3
+
+
+def test_openvino_computes_in_float32_where_fp32_was_asked_for():
+    pytest.importorskip("openvino")
+    what = subject("resnet18")
+    with torch.inference_mode():
+        found = timed.compare(what, timed.make(what, "openvino", setting()))
+    assert found.logits_max < 1e-3  # bf16, its own default where there is AMX: 0.01 and more
+
+
+def test_a_precision_that_an_engine_lacks_says_what_it_has():
+    with pytest.raises(ValueError, match=r"onnxruntime has no bf16 on cpu: it has fp32 on cpu"):
+        engines.check("onnxruntime", "bf16", "cpu")
+    with pytest.raises(ValueError, match=r"no engine called 'openvin' \(did you mean 'openvino'"):
+        engines.check("openvin", "fp32", "cpu")
+
+
+# --- agreement ------------------------------------------------------------------------------------
+
+
+class Wrong(Eager):
+    """Fast and wrong: what it says of one map is changed."""
+
+    change = ("inverse", 1.01)
+
+    def strided(self, image: Tensor) -> dict[str, Tensor]:
+        maps = super().strided(image)
+        name, factor = self.change
+        return maps | {name: maps[name] * factor}
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (("inverse", 1.01), "median relative depth difference 0.0099 .limit 0.001."),
+        (("inverse", float("nan")), "depth difference inf"),
+        (("offset", 1.01), "maps 0.0[0-9]+ of their deviation .limit 0.001."),
+        (("logits", float("nan")), "not finite"),
+    ],
+)
+def test_a_wrong_engine_is_caught_and_not_timed(monkeypatch, change, why):
+    monkeypatch.setattr(Wrong, "change", change)
+    monkeypatch.setattr(engines, "load", lambda name, load=engines.load: _wrong(name, load))
+    row = timed.row(subject(), "eager", "fp32", CPU, PLAN)
+    assert row["status"] == "wrong"
+    assert re.search(why, row["why"]), row["why"]
+    assert not [key for key in row["metric"] if key.startswith("latency.")]
+
+
+def _wrong(name, load):
+    return Wrong if name == "eager" else load(name)
+
+
+def test_instances_are_compared_by_what_they_cover():
+    a = torch.tensor([[[1000, 1001, 1001, 2001], [1000, 1002, 1002, 2001]]])
+    assert agreement.equal_share(a, a) == 1
+    renumbered = a.clone()
+    renumbered[a == 1001], renumbered[a == 1002] = 1005, 1001
+    assert agreement.equal_share(a, renumbered) == 1
+    merged = torch.where(a == 1002, 1001, a)
+    assert agreement.equal_share(a, merged) < 1
+    other_class = torch.where(a == 2001, 3001, a)
+    assert agreement.equal_share(a, other_class) == 0.75
+
+
+def test_agreement_of_known_differences():
+    depth = torch.tensor([[[[1.0, 2], [4, 8]]]])
+    panoptic = torch.tensor([[[1000, 1000], [1000, 2000]]])
+    maps = torch.tensor([[[[1.0, 2], [4, 8]]]])
+
+    def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, Finished]:
+        offset = maps.expand(1, 2, 2, 2)
+        found = Maps(None, center_B1HW=maps, offset_B2HW=offset, logits_BChw=logits)
+        found.inverse_B1HW = maps
+        return found, Finished(panoptic, depth_B1HW=depth)
+
+    found = agreement.Agreement()
+    other = depth * torch.tensor([1, 1, 1, 1.5]).view(2, 2)
+    found.update(
+        pass_of(maps, panoptic, depth), pass_of(maps + 0.5, torch.full_like(panoptic, 1000), other)
+    )
+    assert found.values() == {
+        "agreement.logits_max": 0.5,
+        "agreement.panoptic_equal": 0.75,
+        "agreement.depth_median_rel": 0,
+        "agreement.depth_max_rel": 0.5,
+    }
+    assert found.wrong("fp32") == "75.00 % equal panoptic pixels (limit 99.9 %)"
+    deviations = 0.5 / maps.std()
+    expected = f"maps {deviations:.2g} of their deviation (limit 0.001)"
+    assert found.wrong("fp32", trained=False) == expected
+
+
+# --- rows -----------------------------------------------------------------------------------------
+
+KEYS = (
+    *("mean_ms", "std_ms", "p50_ms", "p95_ms", "p99_ms", "fps"),
+    *("transfer_ms", "network_ms", "postprocess_ms", "passes", "warmup", "images", "threads"),
+    *("device", "precision", "spread", "drift", "noisy", "params_m", "gmacs", "network_mb"),
+    *("throughput_fps", "throughput_batch"),
+)
+
+
+def test_a_row_says_everything_and_its_stages_add_up():
+    row = timed.row(subject(), "eager", "fp32", CPU, PLAN)
+    assert (row["status"], row["why"], row["weights"]) == ("done", "", "random")
+    assert (row["height"], row["width"], row["backbone"]) == (*SIZE, "tiny")
+    metric = row["metric"]
+    assert {f"latency.{key}" for key in KEYS} == {k for k in metric if k.startswith("latency.")}
+    assert metric["latency.passes"] == 4
+    assert metric["latency.images"] == 3
+    assert metric["latency.throughput_batch"] == 2
+    assert type(metric["latency.noisy"]) is bool
+    stages = [metric[f"latency.{name}_ms"] for name in ("transfer", "network", "postprocess")]
+    assert sum(stages) == pytest.approx(metric["latency.mean_ms"], rel=1e-9)
+    assert 0 < metric["roofline.share"] < 1
+    assert "torch" in row["env"]
+
+
+def test_an_engine_that_is_not_there_has_a_row_that_says_how_to_install_it(monkeypatch):
+    find = engines.importlib.util.find_spec
+    monkeypatch.setattr(
+        engines.importlib.util, "find_spec", lambda name: None if name == "openvino" else find(name)
+    )
+    row = timed.row(subject(), "openvino", "fp32", CPU, PLAN)
+    assert row["status"] == "unavailable"
+    assert row["why"].endswith("pip install 'mtl-bench[onnx,openvino]'")
+    assert row["metric"] == {}
+
+
+def test_an_engine_that_breaks_has_a_row_that_says_why(monkeypatch):
+    def broken(*args):
+        raise RuntimeError("no such\nkernel")
+
+    monkeypatch.setattr(Eager, "strided", broken)
+    row = timed.row(subject(), "eager", "fp32", CPU, PLAN)
+    assert (row["status"], row["why"]) == ("failed", "RuntimeError: no such kernel")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without CUDA")
+def test_tensorrt_says_what_it_lacks():
+    row = timed.row(subject(), "tensorrt", "fp16", CPU, PLAN)
+    assert row["status"] == "unavailable"
+    assert "tensorrt" in row["why"] or "CUDA" in row["why"]
+
+
+# --- the protocol ---------------------------------------------------------------------------------
+
+
+def clocked(monkeypatch, times_ms: list[float]) -> list:
+    """Stages of which only the second takes time: each pass the next of these."""
+    clock, queue = {"s": 0.0}, iter(times_ms)
+    monkeypatch.setattr(timed.time, "perf_counter", lambda: clock["s"])
+
+    def work(value):
+        clock["s"] += next(queue) / 1000
+        return value
+
+    return [lambda value: value, work, lambda value: value]
+
+
+def test_warm_up_ends_when_times_stop_falling(monkeypatch):
+    falling = [100.0 - 3 * n for n in range(20)]
+    stages = clocked(monkeypatch, falling + [40.0] * 50)
+    passes = timed.warm_up(stages, itertools.cycle(images(1)), CPU, None)
+    assert 22 <= passes <= 20 + 2 * timed.WINDOW
+
+
+def test_warm_up_has_a_cap_and_a_share_of_the_time_limit(monkeypatch):
+    stages = clocked(monkeypatch, [1000.0 * 0.9**n for n in range(100)])
+    assert timed.warm_up(stages, itertools.cycle(images(1)), CPU, None) == timed.WARMUP
+    stages = clocked(monkeypatch, [1000.0] * 100)
+    assert timed.warm_up(stages, itertools.cycle(images(1)), CPU, 6.5) == 3
+
+
+def test_the_time_limit_leaves_a_least_number_of_passes(monkeypatch):
+    stages = clocked(monkeypatch, [1000.0] * 100)
+    plan = timed.Plan(passes=90, seconds=5)
+    ms = timed.time_passes(stages, itertools.cycle(images(1)), CPU, plan)
+    assert len(ms) == timed.LEAST
+    stages = clocked(monkeypatch, [100.0] * 100)
+    ms = timed.time_passes(stages, itertools.cycle(images(1)), CPU, plan)
+    assert len(ms) == 51  # the one that passes the limit is kept
+
+
+def test_noise_is_said():
+    steady = np.array([[0, 100.0 + n % 3, 0] for n in range(40)])
+    assert timed.spread(steady) == {"spread": pytest.approx(0.02, abs=0.01), "noisy": False}
+    slower = np.array([[0, 100.0 + n / 4, 0] for n in range(40)])
+    assert timed.spread(slower)["noisy"]  # by its drift
+    wild = np.array([[0, 100.0 + 50 * (n % 2), 0] for n in range(40)])
+    assert timed.spread(wild)["noisy"]  # by its spread
+
+
+def test_work_of_a_network_is_that_of_its_convolutions(monkeypatch):
+    class Net(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.conv, self.unused = nn.Conv2d(3, 5, 3, padding=1, bias=False), nn.Conv2d(3, 9, 1)
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.conv(x).relu()
+
+    net = Net()
+    monkeypatch.setattr(roofline, "Body", lambda net: net)
+    with torch.inference_mode():
+        found = roofline.work(net, (1, 8, 16), "bf16")
+    assert found["params_m"] == pytest.approx(135e-6)
+    assert found["gmacs"] == pytest.approx(135 * 128 / 1e9)
+    assert found["network_mb"] == pytest.approx(2 * (3 * 128 + 135 + 5 * 128) / 1e6)
+    assert roofline.share({"gmacs": 1, "network_mb": 1}, 100, 1, 40) == pytest.approx(0.5)
+    assert roofline.share({"gmacs": 0.1, "network_mb": 20}, 100, 1, 40) == pytest.approx(0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
+def test_trained_weights_over_the_val_split(name):
+    """Acceptance: 20 frames of the built-in val split, at the size that the network learned."""
+    found = sorted(Path("runs").glob("*/last.pt"))
+    if not found:
+        pytest.skip("no trained run in runs/")
+    from mtl_bench import deploy
+    from mtl_bench.data import synthetic
+
+    cell, trained = deploy.from_checkpoint(found[0], None)
+    what = deploy.subject(
+        cell, trained, SIZE, synthetic.ensure(cell.recipe.data), CPU, True, images=20
+    )
+    with torch.inference_mode():
+        result = timed.compare(what, timed.make(what, name, setting()), 20)
+    assert result.wrong("fp32") == ""
