@@ -13,6 +13,7 @@ FIGURES = {  # file stem: heading on the page, in its order
     "rmse_fps": "Depth error against frames per second",
     "pq_rmse": "Panoptic quality against depth error",
     "samples": "Sample predictions",
+    "extremes": "Worst and best frame of each row",
     "classes": "Panoptic quality per class",
     "loss_curves": "Training curves",
     "weight_curves": "Learned weights",
@@ -131,6 +132,7 @@ def _draw(table: "Table", out_dir: Path, runs_root: Path | None) -> "list[Figure
         captions["weight_curves"] = curves.terms(table, runs, "weight", out_dir)
         captions["diagnostics"] = curves.diagnostics(table, runs, out_dir)
         captions["samples"] = pictures.draw(table, runs_root, out_dir)
+        captions["extremes"] = pictures.extremes(table, runs_root, out_dir)
     drawn = [(stem, heading, captions.get(stem)) for stem, heading in FIGURES.items()]
     return [Figure(stem, heading, caption) for stem, heading, caption in drawn if caption]
 

@@ -40,7 +40,7 @@ TIMING = (
     "clock",
 )
 COUNTED = ("failed", "fallback")  # dgc.*
-WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples")
+WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples", "extremes")
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def render(
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    drawn = [(figure, _inline(out_dir, figure)) for figure in figures]
+    drawn = [(figure, inline(out_dir, figure)) for figure in figures]
     return (
         environment.get_template(TEMPLATE).render(
             grid=grid,
@@ -164,7 +164,7 @@ def _cells(rows: Sequence[Row]) -> list[list[str]]:
 # --- figures --------------------------------------------------------------------------------------
 
 
-def _inline(out_dir: Path, figure: Figure) -> Markup:
+def inline(out_dir: Path, figure: Figure) -> Markup:
     """The SVG itself, or the PNG as a data URI where there is no SVG."""
     alternative = escape(figure.caption)
     svg = out_dir / f"{figure.name}.svg"

@@ -1,6 +1,5 @@
 """Sample predictions: input, truth and every group's panoptic map and depth, side by side."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,20 +7,20 @@ from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from mtl_bench import render
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
+from mtl_bench.render.depth import RANGES
 from mtl_bench.report.groups import SMOKE
 from mtl_bench.report.style import GRAY, save, styled
 from mtl_bench.report.tables import Table
 
 IMAGES, IMAGES_OF_MANY = 3, 2
 GROUPS = 6  # more would be too small to see, so they are not all there, and of fewer images
-TILE = 192  # pixels wide
-NEAR_M, FAR_M = 2.0, 80.0  # ends of the depth colours, logarithmic between them
-NO_DEPTH = (90, 90, 90)
+TILE, GAP, HEADER = 192, 4, 20  # pixels: width, between tiles, height of a line's own title
+NEAR_M, FAR_M = RANGES["m"]  # ends of the depth colours, logarithmic between them
 Image = NDArray[np.uint8]
 
 
@@ -35,11 +34,16 @@ class Samples:
     true_instance_ids: NDArray[np.int32] | None
     depth_m: NDArray[np.float32] | None  # 0: no value
     true_depth_m: NDArray[np.float32] | None
+    pq: list[float]  # of the extremes, rising; else empty
 
     @staticmethod
-    def load(path: Path) -> "Samples":
+    def load(path: Path, kind: str = "") -> "Samples | None":
+        """The frames at fixed places, or with `extremes.` the worst and best; None: not kept."""
         with np.load(path, allow_pickle=False) as file:
-            values = {key: file[key] for key in file.files}
+            keys = [key for key in file.files if key.rpartition(".")[0] == kind.rstrip(".")]
+            values = {key.removeprefix(kind): file[key] for key in keys}
+        if "names" not in values:
+            return None
         return Samples(
             names=[str(name) for name in values["names"]],
             image=values["image"],
@@ -47,6 +51,7 @@ class Samples:
             true_instance_ids=values.get("true_instance_ids"),
             depth_m=values.get("depth_m"),
             true_depth_m=values.get("true_depth_m"),
+            pq=[float(value) for value in values.get("pq", ())],
         )
 
 
@@ -58,19 +63,14 @@ def draw(
     Returns:
         What the figure shows in words, or None where no run kept samples.
     """
-    found = []
-    for group in table.groups:
-        paths = [runs_root / str(row.get("slug", "")) / "samples.npz" for row in group.rows]
-        path = next((path for path in paths if path.is_file()), None)
-        if path is not None:
-            found.append((group.label, Samples.load(path)))
+    found = _found(table, runs_root)
     if not found:
         return None
     shown = found[:GROUPS]
     images = IMAGES if len(found) == len(shown) else IMAGES_OF_MANY
     lines = _lines([samples for _, samples in shown], images, labels)
     titles = ["input", "truth", *(label for label, _ in shown)]
-    _draw_lines(lines, titles, table.smoke, out_dir)
+    _draw_lines(lines, titles, table.smoke, out_dir, "samples")
     left_out = f" The first {GROUPS} of {len(found)}." if len(found) > GROUPS else ""
     return (
         "Input, ground truth and predictions on the first evaluation images: panoptic maps and "
@@ -79,34 +79,58 @@ def draw(
     )
 
 
-def overlay(image_HW3: Image, instance_ids_HW: NDArray[np.int32], labels: LabelSet) -> Image:
-    """Class colours over the gray image, a shade per instance, white outlines; void stays gray."""
-    ids = instance_ids_HW.astype(np.int64)
-    is_instance = ids >= 1000
-    label_ids = np.where(is_instance, ids // 1000, ids)
-    classes = labels.class_of_label_id()[np.clip(label_ids, 0, 255)]
-    known = classes < len(labels)
-    colors = labels.colors[np.where(known, classes, 0)].astype(float)
-    shade = np.where(is_instance, (ids * 37 % 5) * 18 - 36, 0)  # neighbours differ
-    colors = np.clip(colors + shade[..., None], 0, 255)
-    gray = np.repeat(cv2.cvtColor(image_HW3, cv2.COLOR_RGB2GRAY)[..., None], 3, 2).astype(float)
-    mixed = np.where(known[..., None], 0.7 * colors + 0.3 * gray, gray)
-    edge = np.zeros(ids.shape, bool)
-    edge[:, 1:] |= (ids[:, 1:] != ids[:, :-1]) & (is_instance[:, 1:] | is_instance[:, :-1])
-    edge[1:] |= (ids[1:] != ids[:-1]) & (is_instance[1:] | is_instance[:-1])
-    return np.where(edge[..., None], 255, mixed).astype(np.uint8)
+def extremes(
+    table: Table, runs_root: Path, out_dir: Path, labels: LabelSet = CITYSCAPES20
+) -> str | None:
+    """`extremes.png`: the worst and the best frame of every group's first seed, by PQ.
 
-
-def depth_colors(depth_m_HW: NDArray[np.floating]) -> Image:
-    """Near bright, far dark, logarithmic from NEAR_M to FAR_M; NO_DEPTH where there is no value."""
-    depth = depth_m_HW.astype(np.float64)
-    known = np.isfinite(depth) & (depth > 0)
-    log = np.log(np.where(known, depth, FAR_M) / NEAR_M) / math.log(FAR_M / NEAR_M)
-    colors = colormaps["inferno"](1 - np.clip(log, 0, 1), bytes=True)[..., :3]
-    return np.where(known[..., None], colors, np.array(NO_DEPTH, np.uint8)).astype(np.uint8)
+    Returns:
+        What the figure shows in words, or None where no run kept such frames.
+    """
+    found = _found(table, runs_root, "extremes.")
+    shown = found[:GROUPS]
+    lines: list[list[Image | None]] = []
+    headers, told = [], []
+    for label, samples in shown:
+        lines.append([tile for index in (0, -1) for tile in _triple(samples, index, labels)])
+        worst, best = samples.pq[0], samples.pq[-1]
+        headers.append([f"{label}: PQ {worst:.1f}", "", "", f"PQ {best:.1f}", "", ""])
+        told.append(f"{label} {worst:.1f} and {best:.1f}")
+    if not lines:
+        return None
+    titles = [f"{which}: {what}" for which in ("worst", "best") for what in _TRIPLE]
+    _draw_lines(lines, titles, table.smoke, out_dir, "extremes", headers)
+    left_out = f" The first {GROUPS} of {len(found)}." if len(found) > GROUPS else ""
+    return (
+        "Frames on which each row's first seed has its lowest and its highest panoptic quality, "
+        f"PQ of the frame alone: {'; '.join(told)}.{left_out}"
+    )
 
 
 # --- parts ----------------------------------------------------------------------------------------
+
+
+_TRIPLE = ("input", "truth", "prediction")
+
+
+def _found(table: Table, runs_root: Path, kind: str = "") -> list[tuple[str, Samples]]:
+    """Labels of the groups that kept such frames, with those of the first run that did."""
+    found = []
+    for group in table.groups:
+        paths = [runs_root / str(row.get("slug", "")) / "samples.npz" for row in group.rows]
+        loaded = (Samples.load(path, kind) for path in paths if path.is_file())
+        samples = next((samples for samples in loaded if samples is not None), None)
+        if samples is not None:
+            found.append((group.label, samples))
+    return found
+
+
+def _triple(samples: Samples, index: int, labels: LabelSet) -> list[Image | None]:
+    assert samples.instance_ids is not None
+    assert samples.true_instance_ids is not None
+    image = samples.image[index]
+    maps = (samples.true_instance_ids[index], samples.instance_ids[index])
+    return [_fit(image), *(_map(image, ids, labels) for ids in maps)]
 
 
 def _lines(runs: Sequence[Samples], images: int, labels: LabelSet) -> list[list[Image | None]]:
@@ -136,14 +160,15 @@ def _of(pair: tuple[Samples, int] | None, name: str) -> NDArray[Any] | None:
 
 
 def _depth_tile(depth_m_HW: NDArray[np.floating]) -> Image:
-    return _fit(depth_colors(depth_m_HW), exact=True)
+    return _fit(render.depth_colors(depth_m_HW, NEAR_M, FAR_M), exact=True)
 
 
 def _map(image: Image, ids: NDArray[np.int32], labels: LabelSet) -> Image:
     """Drawn at the tile's size, so that outlines keep their width."""
     small = _fit(image)
     height, width = small.shape[:2]
-    return overlay(small, cv2.resize(ids, (width, height), interpolation=cv2.INTER_NEAREST), labels)
+    ids = cv2.resize(ids, (width, height), interpolation=cv2.INTER_NEAREST)
+    return render.overlay(small, ids, labels)
 
 
 def _fit(image: Image, exact: bool = False) -> Image:
@@ -157,25 +182,37 @@ def _fit(image: Image, exact: bool = False) -> Image:
 
 
 def _draw_lines(
-    lines: Sequence[Sequence[Image | None]], titles: Sequence[str], smoke: bool, out_dir: Path
+    lines: Sequence[Sequence[Image | None]],
+    titles: Sequence[str],
+    smoke: bool,
+    out_dir: Path,
+    name: str,
+    headers: Sequence[Sequence[str]] = (),
 ) -> None:
-    dpi, gap, top = 100, 4, 26 + (20 if smoke else 0)
+    """Tiles below their columns' titles; with headers each line has titles of its own, too."""
+    dpi, top = 100, 26 + (20 if smoke else 0)
+    head = HEADER if headers else 0
     height = next(tile.shape[0] for line in lines for tile in line if tile is not None)
-    canvas_height = top + len(lines) * (height + gap)
-    canvas_width = len(titles) * (TILE + gap)
+    canvas_height = top + len(lines) * (height + GAP + head)
+    canvas_width = len(titles) * (TILE + GAP)
     canvas = np.full((canvas_height, canvas_width, 3), 255, np.uint8)
-    for y, line in enumerate(lines):
+    tops = [top + y * (height + GAP + head) + head for y in range(len(lines))]
+    for up, line in zip(tops, lines, strict=True):
         for x, tile in enumerate(line):
             if tile is not None:
-                up, left = top + y * (height + gap), x * (TILE + gap)
+                left = x * (TILE + GAP)
                 canvas[up : up + height, left : left + TILE] = tile
     with styled():
         figure = Figure(figsize=(canvas_width / dpi, canvas_height / dpi), dpi=dpi)
         figure.figimage(canvas, origin="upper")
         for x, title in enumerate(titles):
-            center = (x * (TILE + gap) + TILE / 2) / canvas_width
+            center = (x * (TILE + GAP) + TILE / 2) / canvas_width
             size = min(9, 245 / len(title))  # a long one fits its tile
             figure.text(center, 1 - (top - 8) / canvas_height, title, ha="center", fontsize=size)
+        for up, texts in zip(tops, headers, strict=False):
+            for x, text in enumerate(texts):
+                place = x * (TILE + GAP) / canvas_width, 1 - (up - 6) / canvas_height
+                figure.text(*place, text, fontsize=8.5)
         if smoke:
             figure.text(0.5, 1 - 14 / canvas_height, SMOKE, ha="center", color=GRAY, fontsize=9)
-        save(figure, out_dir, "samples", pixels=True)
+        save(figure, out_dir, name, pixels=True)
