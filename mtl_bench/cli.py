@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from mtl_bench.commands import cell, data, grid, look, pseudo
+from mtl_bench.commands import cell, data, deploy, figure, grid, look, predict, pseudo
 
 TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # no space, over quota, read-only
@@ -50,7 +50,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Example: mtl-bench ablate --grid backbones",
 )
-for module in (grid, cell, pseudo, data, look):
+for module in (grid, cell, pseudo, predict, figure, deploy, data, look):
     module.register(app)
 
 

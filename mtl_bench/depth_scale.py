@@ -53,8 +53,10 @@ def dgc_scale(
         pitch_rad_B: the calibrated pitch to start from, positive looks down; None = level.
     """
     step = math.ceil(math.sqrt(depth_B1HW.shape[2] * depth_B1HW.shape[3] / GRID))
-    depth_BHW = depth_B1HW[:, 0, ::step, ::step].double()
-    ray_x_BHW, ray_y_BHW = _rays(depth_BHW, K_B33.double(), step)
+    # ONNX Runtime lacks some operators in double precision
+    dtype = torch.float32 if torch.compiler.is_exporting() else torch.float64
+    depth_BHW = depth_B1HW[:, 0, ::step, ::step].to(dtype)
+    ray_x_BHW, ray_y_BHW = _rays(depth_BHW, K_B33.to(dtype), step)
     usable_BHW = (depth_BHW > 0) & depth_BHW.isfinite() & (ray_y_BHW > 0)
     usable_BHW &= ray_y_BHW > BELOW_HORIZON * ray_y_BHW[:, -1:, :]
 
@@ -65,7 +67,8 @@ def dgc_scale(
     if road_BHW is not None:
         road_BHW = road_BHW[:, ::step, ::step] & usable_BHW
         has_road_B = road_BHW.sum((1, 2)) >= max(least, 3)
-        ground_BHW = torch.where(has_road_B[:, None, None], road_BHW, flat_BHW)
+        by_road_B11 = has_road_B[:, None, None]
+        ground_BHW = (by_road_B11 & road_BHW) | (~by_road_B11 & flat_BHW)
 
     pitch_B11 = torch.zeros_like(depth_BHW[:, :1, :1])
     if pitch_rad_B is not None:
@@ -75,7 +78,7 @@ def dgc_scale(
     height_B = _height(depth_BHW, ray_x_BHW, down_BHW, ground_BHW, max_tilt, pitch_B11[:, :, 0])
     source_B = torch.where(has_road_B, ROAD, torch.where(has_flat_B, NORMALS, FAILED))
     source_B = torch.where((height_B > 0) & height_B.isfinite(), source_B, FAILED)
-    scale_B = camera_height_m_B.double() / height_B
+    scale_B = camera_height_m_B.to(dtype) / height_B
     return scale_B.masked_fill(source_B == FAILED, torch.nan).to(depth_B1HW.dtype), source_B
 
 
@@ -99,22 +102,45 @@ def _height(
 ) -> Tensor:
     """Median height [B] of the camera above the ground pixels; NaN without any.
 
-    `down` is the ray's part along g, straight down for a camera of the calibrated pitch. With
-    n = (g + p x + q z) / |.| a plane has 1 / (depth * down) = c (1 + p ray_x / down + q / down): a
-    regression whose noise is alike everywhere. Least absolute deviations, by reweighting.
+    `down` is the ray's part along g, straight down for a camera of the calibrated pitch.
     """
     flat = depth_BHW.flatten(1).shape
     ground_BP = ground_BHW.reshape(flat)
+    down_BP = torch.where(ground_BP, down_BHW.reshape(flat), 1)
+    depth_BP = torch.where(ground_BP, depth_BHW.reshape(flat), torch.inf)
+    median_B = _median(depth_BP * down_BP, ground_BP)  # the height, were there no tilt
+    if max_tilt == 0:
+        return median_B
     x_BP = torch.where(ground_BP, ray_x_BHW.reshape(flat), 0)
-    y_BP = torch.where(ground_BP, down_BHW.reshape(flat), 1)
-    depth_BP = torch.where(ground_BP, depth_BHW.reshape(flat), torch.nan)
-    level_BP = depth_BP * y_BP  # the height, were there no tilt
-    median_B1 = level_BP.nanmedian(1, keepdim=True).values
-    inverse_BP = torch.nan_to_num(median_B1 / level_BP)  # about 1, which scales the regression
-    basis_B3P = torch.stack([torch.ones_like(y_BP), x_BP / y_BP, 1 / y_BP], 1) * ground_BP[:, None]
+    p_B1, q_B1 = _tilt(depth_BP * down_BP / median_B[:, None], x_BP, down_BP, ground_BP, max_tilt)
+    length_B1 = (1 + p_B1**2 + q_B1**2 + 2 * q_B1 * pitch_B1.sin()).sqrt()
+    return _median(depth_BP * (p_B1 * x_BP + down_BP + q_B1) / length_B1, ground_BP)
 
-    weight_BP = ground_BP.to(depth_BP)
-    ridge = 1e-12 * torch.eye(3, device=depth_BP.device, dtype=depth_BP.dtype)
+
+def _median(value_BP: Tensor, counts_BP: Tensor) -> Tensor:
+    """The lower median [B] of what counts, NaN where nothing does; the rest has to be inf.
+
+    torch.nanmedian cannot be exported.
+    """
+    count_B1 = counts_BP.sum(1, keepdim=True)
+    median_B1 = value_BP.sort(1).values.gather(1, (count_B1 - 1).clamp(min=0) // 2)
+    return torch.where(count_B1 > 0, median_B1, torch.nan)[:, 0]
+
+
+def _tilt(
+    level_BP: Tensor, x_BP: Tensor, down_BP: Tensor, ground_BP: Tensor, max_tilt: float
+) -> tuple[Tensor, Tensor]:
+    """Tangents p and q [B,1] of the ground's roll and pitch against g.
+
+    With n = (g + p x + q z) / |.| a plane has 1 / (depth * down) = c (1 + p ray_x / down + q /
+    down): a regression whose noise is alike everywhere. Least absolute deviations, by reweighting.
+    `level` is depth * down in units of its median, which scales the regression.
+    """
+    inverse_BP = torch.nan_to_num(1 / level_BP)
+    basis_B3P = torch.stack([torch.ones_like(x_BP), x_BP / down_BP, 1 / down_BP], 1)
+    basis_B3P = basis_B3P * ground_BP[:, None]
+    weight_BP = ground_BP.to(level_BP)
+    ridge = 1e-12 * torch.eye(3, device=x_BP.device, dtype=x_BP.dtype)
     for _ in range(REWEIGHTINGS):
         weighted_B3P = basis_B3P * weight_BP[:, None]
         normal_B33 = weighted_B3P @ basis_B3P.mT
@@ -126,11 +152,9 @@ def _height(
 
     slope_B, tilt_x_B, tilt_z_B = solution_B31.squeeze(2).unbind(1)
     sound_B = slope_B > 0.1  # of about 1; otherwise there is no ground in this depth: no tilt
-    p_B1 = torch.where(sound_B, tilt_x_B / slope_B, 0).clamp(-max_tilt, max_tilt)[:, None]
-    q_B1 = torch.where(sound_B, tilt_z_B / slope_B, 0).clamp(-max_tilt, max_tilt)[:, None]
-    length_B1 = (1 + p_B1**2 + q_B1**2 + 2 * q_B1 * pitch_B1.sin()).sqrt()
-    height_BP = depth_BP * (p_B1 * x_BP + y_BP + q_B1) / length_B1
-    return height_BP.nanmedian(1).values
+    p_B = torch.where(sound_B, tilt_x_B / slope_B, 0).clamp(-max_tilt, max_tilt)
+    q_B = torch.where(sound_B, tilt_z_B / slope_B, 0).clamp(-max_tilt, max_tilt)
+    return p_B[:, None], q_B[:, None]
 
 
 def _horizontal(depth_BHW: Tensor, ray_x_BHW: Tensor, ray_y_BHW: Tensor) -> Tensor:

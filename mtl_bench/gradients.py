@@ -128,19 +128,19 @@ class _Parameters:
         self.shared = self.space = shared
         self.rows: list[list[Tensor | None]] = [[] for _ in range(losses)]
         self.begun: set[int] = set()
-        self.J_TP: Tensor | None = None
-        if matrix:  # filled row by row: a second copy may cost as much as the network
-            P = sum(parameter.numel() for parameter in shared)
-            self.J_TP = torch.zeros(losses, P, device=shared[0].device)
+        self.matrix, self.J_TP = matrix, torch.empty(0)
 
     def add(self, z: Sequence[Tensor], z_grads_of: dict[int, Gradient]) -> None:
+        if self.matrix and not self.begun:  # not before: the decoders need memory, too
+            P = sum(parameter.numel() for parameter in self.shared)
+            self.J_TP = torch.zeros(len(self.rows), P, device=z[0].device)
         for index in list(z_grads_of):
             grads = onward(z, z_grads_of.pop(index), self.shared, keep=len(z_grads_of) > 0)
             first = index not in self.begun
             self.begun.add(index)
-            if self.J_TP is None:
+            if not self.matrix:
                 self.rows[index] = list(grads) if first else add(self.rows[index], grads)
-            elif first:
+            elif first:  # row by row: a second copy may cost as much as the network
                 flatten(grads, self.shared, out=self.J_TP[index])
             else:
                 self.J_TP[index] += flatten(grads, self.shared)
@@ -148,7 +148,7 @@ class _Parameters:
     def found(
         self, here: Sequence[int], divisors: Sequence[float]
     ) -> tuple[list[list[Tensor | None]], Tensor | None]:
-        if self.J_TP is None:
+        if not self.matrix:
             return [divided(self.rows[i], n) for i, n in zip(here, divisors, strict=True)], None
         J_KP = self.J_TP if len(here) == len(self.J_TP) else self.J_TP[list(here)]
         for row, divisor in zip(J_KP, divisors, strict=True):

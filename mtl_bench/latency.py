@@ -70,7 +70,7 @@ def measure(
         ValueError: no images or no passes.
     """
     engine = Engine(torch.device(device), precision)
-    hosts, K_133 = _prepare(images, K_33, latency, pin=engine.device.type == "cuda")
+    hosts, K_133 = prepare(images, K_33, latency, pin=engine.device.type == "cuda")
     if latency.passes < 1:
         raise ValueError(f"latency.passes must be at least 1, not {latency.passes}")
     stages = _stages(model, engine, K_133, camera_height_m, things, evaluate, road)
@@ -79,12 +79,12 @@ def measure(
         with torch.inference_mode():
             rounds = itertools.cycle(hosts)
             for _ in range(latency.warmup):
-                _time_pass(stages, next(rounds), engine.device)
+                time_pass(stages, next(rounds), engine.device)
             gc.collect()
             passes = itertools.islice(rounds, latency.passes)
-            ms = np.array([_time_pass(stages, host, engine.device) for host in passes])
+            ms = np.array([time_pass(stages, host, engine.device) for host in passes])
     values = {
-        **_statistics(ms),
+        **statistics(ms),
         **cost,
         "passes": latency.passes,
         "warmup": latency.warmup,
@@ -92,14 +92,14 @@ def measure(
         "height": hosts[0].shape[-2],
         "width": hosts[0].shape[-1],
         "threads": torch.get_num_threads(),
-        "device": _device_name(engine.device),
+        "device": device_name(engine.device),
         "precision": precision,
         "clock": "CUDA events" if engine.device.type == "cuda" else "time.perf_counter",
     }
     return {f"latency.{key}": value for key, value in values.items()}
 
 
-def _prepare(
+def prepare(
     images: Iterable[Batch | Tensor], K_33: Tensor, latency: config.Latency, pin: bool
 ) -> tuple[list[Tensor], Tensor]:
     """Host images, each uint8 [1,3,H,W] as a camera delivers them, and their intrinsics [1,3,3]."""
@@ -164,7 +164,7 @@ def _stages(
     return [transfer, network, finish]
 
 
-def _time_pass(stages: list[Stage], host: Tensor, device: torch.device) -> list[float]:
+def time_pass(stages: list[Stage], host: Tensor, device: torch.device) -> list[float]:
     """Milliseconds of each stage."""
     value: Any = host
     if device.type != "cuda":
@@ -184,7 +184,7 @@ def _time_pass(stages: list[Stage], host: Tensor, device: torch.device) -> list[
     return [a.elapsed_time(b) for a, b in itertools.pairwise(events)]
 
 
-def _statistics(ms: np.ndarray) -> dict[str, float]:
+def statistics(ms: np.ndarray) -> dict[str, float]:
     """Of the times [passes, stages]."""
     total = ms.sum(1)
     quarter = max(1, len(total) // 4)
@@ -295,5 +295,5 @@ def _tensors_in(value: Any) -> Iterator[Tensor]:
             yield from _tensors_in(item)
 
 
-def _device_name(device: torch.device) -> str:
+def device_name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_model()

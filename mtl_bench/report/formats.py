@@ -1,7 +1,7 @@
 """The table as CSV, Markdown, LaTeX and on a terminal: the same numbers in four spellings."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -28,6 +28,7 @@ TEX = {
     "<": r"\textless{}",
     ">": r"\textgreater{}",
     "|": r"\textbar{}",
+    "\u2020": r"$\dagger$",
 }
 ARROWS_TEX = {+1: r"$\uparrow$", -1: r"$\downarrow$"}
 IN_SUMMARY = ("pq", "abs_rel", "rmse", "fps")
@@ -122,16 +123,17 @@ def markdown(table: Table, short: bool = False) -> str:
             lines.append([*group.names, seeds(group), *(f"**{t}**" if b else t for t, b in shown)])
         names = [axis_title(axis) for axis in table.axes]
         parts += [f"**{heading}**"] * bool(heading)
-        parts.append(_grid([*names, "n", *head], lines, len(names)))
+        parts.append(pipe_table([*names, "n", *head], lines, range(len(names))))
     if table.unfinished:
         lines = [[cell.label, cell.status, cell.reason] for cell in table.unfinished]
-        parts.append(f"**Without numbers**\n\n{_grid(['cell', 'status', 'why'], lines, 3)}")
+        parts.append(
+            f"**Without numbers**\n\n{pipe_table(['cell', 'status', 'why'], lines, range(3))}"
+        )
     for source in table.published:
         head = [axis_title(table.axes[0]), *(f"{name} {a}" for name, a in published_head(source))]
         lines = [[row["name"], *published_values(row, source)] for row in source["rows"]]
-        parts.append(
-            f"**{source['mark']}**, not comparable with the rows above\n\n{_grid(head, lines, 1)}"
-        )
+        grid = pipe_table(head, lines, range(1))
+        parts.append(f"**{source['mark']}**, not comparable with the rows above\n\n{grid}")
         parts.append(f"{source['source']}: {', '.join(about(source))}.")
     parts.append("\n".join(f"- {pretty(note)}" for note in footnotes(table)))
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -152,12 +154,14 @@ def latex(table: Table) -> str:
         heads = [[*(tex(axis_title(a)) for a in table.axes), "n", *head], [*blank, "", *units]]
         caption = f"{SMOKE.capitalize()}. " if table.smoke else ""
         caption = f"{caption}{heading}. {notes}" if heading == "Quality" else f"{caption}{heading}."
-        parts.append(_float(heads, lines, len(table.axes), caption, fit=True))
+        parts.append(floating(heads, lines, range(len(table.axes)), caption, fit=True))
     for source in table.published:
         head = [f"{name} {a}" for name, a in published_head(source, ARROWS_TEX)]
         lines = [[tex(row["name"]), *published_values(row, source)] for row in source["rows"]]
         caption = f"{source['mark']}. {source['source']}. {sentence(source['note'])}."
-        parts.append(_float([[axis_title(table.axes[0]), *head]], lines, 1, caption, fit=False))
+        parts.append(
+            floating([[axis_title(table.axes[0]), *head]], lines, range(1), caption, fit=False)
+        )
     return "\n\n".join(parts) + "\n"
 
 
@@ -241,9 +245,9 @@ def _metrics(source: Mapping[str, Any]) -> list[str]:
     return [name for name in PUBLISHED if any(name in row for row in source["rows"])]
 
 
-def _grid(head: Sequence[str], lines: Sequence[Sequence[str]], left: int) -> str:
-    """A Markdown table whose first `left` columns are text."""
-    rule = ["---" if i < left else "---:" for i in range(len(head))]
+def pipe_table(head: Sequence[str], lines: Sequence[Sequence[str]], left: Collection[int]) -> str:
+    """A Markdown table; columns whose index is in `left` are text."""
+    rule = ["---" if i in left else "---:" for i in range(len(head))]
     escaped = [[cell.replace("|", r"\|") for cell in line] for line in (head, rule, *lines)]
     return "\n".join(f"| {' | '.join(line)} |" for line in escaped)
 
@@ -255,15 +259,22 @@ def _latex_entry(value: Entry, column: Column, count: int) -> str:
     return mean + (rf"{{\scriptsize\,{spread}}}" if spread else "")
 
 
-def _float(
+def floating(
     heads: Sequence[Sequence[str]],
     lines: Sequence[Sequence[str]],
-    left: int,
+    left: Collection[int],
     caption: str,
     fit: bool,
+    below: str = "",
 ) -> str:
-    """A LaTeX table; `fit` shrinks it to the width of the text."""
-    columns = "l" * left + "r" * (len(heads[0]) - left)
+    """A LaTeX table; `fit` shrinks it to the width of the text.
+
+    Args:
+        left: indices of the columns of text.
+        below: LaTeX that stands in small print below the caption.
+    """
+    columns = "".join("l" if i in left else "r" for i in range(len(heads[0])))
+    notes = [rf"\par\smallskip\raggedright\scriptsize {below}"] if below else []
     body = [" & ".join(line) + r" \\" for line in lines]
     tabular = [
         rf"\begin{{tabular}}{{{columns}}}",
@@ -277,5 +288,8 @@ def _float(
     if fit:
         tabular = [r"\resizebox{\textwidth}{!}{%", *tabular[:-1], tabular[-1] + "}"]
     return "\n".join(
-        [r"\begin{table}", r"\centering", *tabular, rf"\caption{{{tex(caption)}}}", r"\end{table}"]
+        [
+            *(r"\begin{table}", r"\centering", *tabular),
+            *(rf"\caption{{{tex(caption)}}}", *notes, r"\end{table}"),
+        ]
     )

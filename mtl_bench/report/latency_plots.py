@@ -1,0 +1,242 @@
+"""The figures of a grid of latencies: quality over speed, stages, roofline; a panel for each size.
+
+Colour is the backbone, marker the engine, filling the precision: the same in every figure.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from mtl_bench.config import TASKS
+from mtl_bench.report import pareto
+from mtl_bench.report.groups import SMOKE
+from mtl_bench.report.latency_table import LatencyTable, Line
+from mtl_bench.report.style import GRAY, MARKERS, looks, save, styled
+
+FILLS = {"fp32": "full", "bf16": "left", "fp16": "none"}
+STAGES = (
+    ("transfer_ms", "transfer"),
+    ("network_ms", "network"),
+    ("postprocess_ms", "post-processing"),
+)
+QUALITIES = {"pq": ("PQ, % (higher is better)", +1), "rmse": ("RMSE, m (lower is better)", -1)}
+BAR = 0.19  # inches
+
+
+def against_quality(table: LatencyTable, name: str, out_dir: Path) -> str | None:
+    """`<name>_fps`: a backbone's quality against each engine's speed, and the Pareto front.
+
+    Args:
+        name: pq | rmse.
+
+    Returns:
+        What the figure shows in words, or None where no timing with all tasks has a quality.
+    """
+    values = {quality.backbone: getattr(quality, name) for quality in table.quality}
+    lines = [li for li in _whole(table) if li.row["backbone"] in values]
+    if not lines:
+        return None
+    title, better = QUALITIES[name]
+    with styled():
+        figure, panels = _panels(table, lines)
+        fronts = [
+            [(line.values["fps"], values[line.row["backbone"]]) for line in own]
+            for _, own in panels
+        ]
+        for (axes, own), points in zip(panels, fronts, strict=True):
+            for line, point in zip(own, points, strict=True):
+                axes.plot(*point, linestyle="", **_marker(table, line))
+            _plain_log(axes, "FPS (higher is better)")
+            axes.margins(0.12)
+        for (axes, _), points in zip(panels, fronts, strict=True):  # they share the y axis
+            pareto.draw(axes, points, better)
+        panels[0][0].set_ylabel(title)
+        _legend(figure, table, lines, [Line2D([], [], color=GRAY, label="Pareto front")])
+        save(figure, out_dir, f"{name}_fps")
+    return f"{title.partition(',')[0]} over frames per second, all tasks. {_where_from(table)}"
+
+
+def stages(table: LatencyTable, out_dir: Path) -> str | None:
+    """`stages`: where a frame's time goes, a bar for each timing."""
+    lines = _whole(table) or table.measured
+    if not lines:
+        return None
+    shades = ("#9ecae1", "#0072B2", "#D55E00")
+    with styled():
+        figure, panels = _panels(table, lines, BAR)
+        for axes, own in panels:
+            left = np.zeros(len(own))
+            for (key, _), color in zip(STAGES, shades, strict=True):
+                widths = np.array([line.values[key] for line in own])
+                axes.barh(range(len(own)), widths, left=left, color=color, height=0.75)
+                left += widths
+            for y, total in enumerate(left):
+                axes.text(total, y, f" {total:.0f}", va="center", fontsize=6.5, color=GRAY)
+            named = [" ".join((li.names[0], li.engine, li.names[3])) for li in own]
+            axes.set_yticks(range(len(own)), named, fontsize=7)
+            axes.invert_yaxis()
+            axes.grid(False, axis="y")
+            axes.set_xlim(0, 1.12 * left.max())
+            axes.set_xlabel("ms a frame")
+        handles = [
+            Patch(color=color, label=label)
+            for (_, label), color in zip(STAGES, shades, strict=True)
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=3)
+        save(figure, out_dir, "stages")
+    tasks = lines[0].names[1]
+    return f"Mean time of each stage of a frame, {tasks}, batch 1; the number is their sum in ms."
+
+
+def roofline(table: LatencyTable, out_dir: Path) -> str | None:
+    """`roofline`: the network's arithmetic a second against what the machine can do at most."""
+    lines = [line for line in _whole(table) or table.measured if _has_roof(line)]
+    if not lines:
+        return None
+    with styled():
+        figure, panels = _panels(table, lines)
+        for axes, own in panels:
+            points = [_work(line) for line in own]
+            for line, point in zip(own, points, strict=True):
+                axes.plot(*point, linestyle="", **_marker(table, line))
+            _roofs(axes, own, [x for x, _ in points])
+            axes.set_yscale("log")
+            _plain_log(axes, "operations a byte")
+        panels[0][0].set_ylabel("GFLOP/s of the network")
+        _legend(figure, table, lines, [])
+        save(figure, out_dir, "roofline")
+    best = max(lines, key=lambda line: line.values["roofline"])
+    metric = best.row["metric"]
+    gflops, megabytes = 2 * metric["latency.gmacs"], metric["latency.network_mb"]
+    return (
+        "Operations (two a multiply-add) a second of the network stage over operations a byte that "
+        "it moves at least; lines: the machine's measured peak of arithmetic and of memory. "
+        f"Nearest to its roof: {best.label}, {best.values['roofline']:.0f} % of what "
+        f"{gflops:.1f} GFLOP and {megabytes:.0f} MB a frame allow at "
+        f"{metric['roofline.peak_gflops']:.0f} GFLOP/s and {metric['roofline.peak_gbs']:.1f} GB/s."
+    )
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+def _whole(table: LatencyTable) -> list[Line]:
+    """The timings with numbers and all tasks: what a cell of all tasks has the quality of."""
+    return [line for line in table.measured if set(line.row["tasks"]) == set(TASKS)]
+
+
+def _panels(
+    table: LatencyTable, lines: Sequence[Line], bar: float = 0.0
+) -> tuple[Figure, list[tuple[Axes, list[Line]]]]:
+    """Axes for each size that has lines, side by side.
+
+    Args:
+        bar: height of a line's bar, inches; then the panels stand below each other.
+    """
+    groups = {size: [line for line in lines if line.size == size] for size in table.sizes}
+    groups = {size: own for size, own in groups.items() if own}
+    count = len(groups)
+    if bar:
+        heights = [0.9 + bar * len(own) for own in groups.values()]
+        figure = Figure(figsize=(7.2, sum(heights) + 0.3), layout="constrained")
+        ratios: dict[str, Any] = {"height_ratios": heights}
+        found = figure.subplots(count, 1, squeeze=False, gridspec_kw=ratios)[:, 0]
+    else:
+        figure = Figure(figsize=(2.4 + 2.9 * count, 4.2), layout="constrained")
+        found = figure.subplots(1, count, squeeze=False, sharey=True)[0]
+    for axes, size in zip(found, groups, strict=True):
+        axes.set_title(size)
+    if table.smoke:
+        figure.suptitle(SMOKE, color="#a40000")
+    return figure, list(zip(found, groups.values(), strict=True))
+
+
+def _marker(table: LatencyTable, line: Line) -> dict[str, Any]:
+    engines = dict.fromkeys(li.engine for li in table.lines)
+    look = looks(dict.fromkeys(li.names[0] for li in table.lines))[line.names[0]]
+    return {
+        "marker": MARKERS[list(engines).index(line.engine) % len(MARKERS)],
+        "color": look.color,
+        "fillstyle": FILLS[line.names[3]],
+        "markerfacecoloralt": "white",
+        "markersize": 7,
+        "markeredgewidth": 1.2,
+    }
+
+
+def _legend(
+    figure: Figure, table: LatencyTable, lines: Sequence[Line], more: Sequence[Line2D]
+) -> None:
+    """What colour, marker and filling say, as far as the lines have them."""
+    handles: list[Any] = []
+    for place in (0, 2, 3):  # backbone, engine, precision
+        for name in dict.fromkeys(line.names[place] for line in lines):
+            line = next(li for li in lines if li.names[place] == name)
+            shown = _marker(table, line)
+            shown |= {0: {"marker": "o"}, 2: {}, 3: {"marker": "h"}}[place]
+            shown |= {"color": GRAY} if place else {}
+            shown |= {"fillstyle": "full"} if place != 3 else {}
+            handles.append(Line2D([], [], linestyle="", label=name, **shown))
+    figure.legend(handles=[*handles, *more], loc="outside right upper")
+
+
+def _plain_log(axes: Axes, label: str) -> None:
+    """A logarithmic x axis with 1, 2, 5, 10 in plain digits."""
+    axes.set_xscale("log")
+    axes.set_xlabel(label)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _where_from(table: LatencyTable) -> str:
+    """Of which networks quality and speed are: not the same ones, and the reader must know."""
+    recipes = {(q.recipe["name"], q.size, q.recipe["network"]["channels"]) for q in table.quality}
+    named = "; ".join(
+        f"recipe {name} ({size} images, decoders of {channels} channels)"
+        for name, size, channels in sorted(recipes)
+    )
+    seeds = sorted({quality.seeds for quality in table.quality})
+    timed = " or ".join(dict.fromkeys(str(li.row["timing"]["recipe"]) for li in table.measured))
+    return (
+        f"Quality is measured at the training recipe's size: {named}, n = "
+        f"{' or '.join(map(str, seeds))}; speed is measured at the deployed size above each panel, "
+        f"with the network of recipe {timed}. A point has the backbone in common, not the weights. "
+        "The front: what no other point beats in both."
+    )
+
+
+def _has_roof(line: Line) -> bool:
+    metric = line.row["metric"]
+    needed = ("latency.gmacs", "latency.network_mb", "roofline.peak_gflops", "roofline.peak_gbs")
+    return all(metric.get(key) for key in needed) and not math.isnan(line.values["roofline"])
+
+
+def _work(line: Line) -> tuple[float, float]:
+    """Operations a byte, and GFLOP/s."""
+    metric = line.row["metric"]
+    gflop = 2 * metric["latency.gmacs"]
+    return gflop * 1000 / metric["latency.network_mb"], gflop * 1000 / line.values["network_ms"]
+
+
+def _roofs(axes: Axes, lines: Sequence[Line], intensities: Sequence[float]) -> None:
+    """One roof for each precision: the highest peaks that any of its timings measured."""
+    roofs: dict[tuple[float, ...], list[str]] = {}
+    for precision in dict.fromkeys(line.names[3] for line in lines):
+        metrics = [line.row["metric"] for line in lines if line.names[3] == precision]
+        peaks = [max(m[f"roofline.{key}"] for m in metrics) for key in ("peak_gflops", "peak_gbs")]
+        roofs.setdefault(tuple(peaks), []).append(precision)
+    ridges = [gflops / gbs for gflops, gbs in roofs]
+    x = np.geomspace(min([*ridges, *intensities]) / 3, max([*ridges, *intensities]) * 3, 64)
+    for (gflops, gbs), precisions in roofs.items():
+        axes.plot(x, np.minimum(gflops, gbs * x), color=GRAY, linewidth=1.2, zorder=1)
+        named = f"{', '.join(precisions)}: {gflops:.0f} GFLOP/s, {gbs:.0f} GB/s"
+        axes.text(x[-1], 1.05 * gflops, named, ha="right", va="bottom", fontsize=7.5, color=GRAY)
