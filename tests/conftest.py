@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # nothing may be downloaded in a test
 
@@ -15,13 +16,18 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"  # real samples; not in 
 
 
 @pytest.fixture(autouse=True)
-def own_signal_handlers():
-    """A cell that runs inside a test takes signals; the next test gets its own again."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    handlers = [signal.getsignal(number) for number in numbers]
+def as_at_the_start():
+    """Signals and threads are the process's own: what runs inside a test leaves them as they were.
+
+    Ctrl-C interrupts in every test, also where pytest itself was started in the background.
+    """
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    threads = torch.get_num_threads()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    for number, handler in zip(numbers, handlers, strict=True):
+    for number, handler in handlers.items():
         signal.signal(number, handler)
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,6 @@ ORDER = (
         "export_predictions",
     ),
     *("latency", "engines", "export", "render", "predict"),
-    *("cameras", "video", "point_cloud", "recording", "prediction_files", "predictions"),
     *("claim", "results", "stored", "deploy", "run", "check"),
     *(
         "toml_file",

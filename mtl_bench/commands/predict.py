@@ -11,7 +11,7 @@ from mtl_bench.commands import options as o
 
 if TYPE_CHECKING:
     from mtl_bench.predict import Predictor
-    from mtl_bench.predictions import Job
+    from mtl_bench.predict.job import Job
 
 CAMERA, OUTPUT = "The camera", "What is written"
 
@@ -111,8 +111,8 @@ def predict(
     quiet: o.QuietOption = False,
 ) -> None:
     """Predict images or a video: panoptic overlay, depth, ids and point cloud, or a video of it."""
-    from mtl_bench import predictions
-    from mtl_bench.cameras import Given
+    from mtl_bench.predict import job as predictions
+    from mtl_bench.predict.cameras import Given
 
     given = Given(camera, calib, _focal_and_center(fx, fy, cx, cy), camera_height)
     paths = predictions.find(inputs)
@@ -155,7 +155,7 @@ def _kinds(what: str | None, video: bool, tasks: tuple[str, ...]) -> list[str]:
     Raises:
         ValueError: an unknown kind, or one of a task that the cell lacks.
     """
-    from mtl_bench.prediction_files import NEEDS
+    from mtl_bench.predict.files import NEEDS
 
     if what is None:
         return [] if video else [kind for kind, task in NEEDS.items() if task in tasks]

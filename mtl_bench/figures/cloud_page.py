@@ -19,8 +19,8 @@ from mtl_bench import render
 from mtl_bench.data.labels import LabelSet
 from mtl_bench.data.targets import DIVISOR
 from mtl_bench.figures.frames import Shown
-from mtl_bench.point_cloud import PointCloud, from_prediction
-from mtl_bench.prediction_files import OVERLAP, denser
+from mtl_bench.predict.files import OVERLAP, denser
+from mtl_bench.predict.point_cloud import PointCloud, from_prediction
 
 TEMPLATE = "cloud.html.j2"
 POINTS = 500_000  # at most: 11 bytes each, 4/3 of that in base64, are 7.3 MB

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from mtl_bench import results
-from mtl_bench.cameras import Given, Mounted, camera_of
 from mtl_bench.config import Cell, did_you_mean
 from mtl_bench.data import cityscapes_files as cityscapes
 from mtl_bench.data import kitti_files, kitti_splits
@@ -15,9 +14,10 @@ from mtl_bench.data.labels import LabelSet
 from mtl_bench.data.layouts import KITTI, layout_of
 from mtl_bench.engine import Engine, choose_device
 from mtl_bench.predict import Predicted, Predictor
+from mtl_bench.predict.cameras import Given, Mounted, camera_of
+from mtl_bench.predict.video import read_image
 from mtl_bench.stored import load_model
 from mtl_bench.train import CHECKPOINT
-from mtl_bench.video import read_image
 
 
 @dataclass(frozen=True)

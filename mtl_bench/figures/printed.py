@@ -23,7 +23,7 @@ from mtl_bench.data.labels import LabelSet
 from mtl_bench.figures.files import write_whole
 from mtl_bench.figures.frames import Shown
 from mtl_bench.predict import Image, Predicted
-from mtl_bench.prediction_files import cloud_picture
+from mtl_bench.predict.files import cloud_picture
 from mtl_bench.render.depth import RANGES, ticks
 from mtl_bench.report.style import styled
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from mtl_bench.data.labels import LabelSet
-from mtl_bench.point_cloud import from_prediction
 from mtl_bench.predict import METRES, Predicted
+from mtl_bench.predict.point_cloud import from_prediction
 from mtl_bench.render import overlay
 
 MOST_POINTS = 50_000  # a frame: of a video's 200 frames all points would be gigabytes

@@ -19,11 +19,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.cameras import Given, Mounted, camera_of
 from mtl_bench.predict import Image, Predicted, Predictor
-from mtl_bench.prediction_files import video_frame, write_files
-from mtl_bench.recording import Recording, missing
-from mtl_bench.video import IMAGE_SUFFIXES, Reader, Writer, is_image, read_image
+from mtl_bench.predict.cameras import Given, Mounted, camera_of
+from mtl_bench.predict.files import video_frame, write_files
+from mtl_bench.predict.recording import Recording, missing
+from mtl_bench.predict.video import IMAGE_SUFFIXES, Reader, Writer, is_image, read_image
 
 RECORD = "prediction.json"
 Progress = Callable[[int, int], None]  # frames done, frames in all (0: not known)

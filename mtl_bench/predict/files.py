@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from mtl_bench import render
 from mtl_bench.data.labels import LabelSet
-from mtl_bench.point_cloud import from_prediction, write_npz, write_ply
 from mtl_bench.predict import Image, Predicted
+from mtl_bench.predict.point_cloud import from_prediction, write_npz, write_ply
 
 KINDS = ("overlay", "depth", "ids", "points")
 NEEDS = {"overlay": "panoptic", "depth": "depth", "ids": "panoptic", "points": "depth"}  # task
