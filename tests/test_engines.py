@@ -222,8 +222,8 @@ def test_agreement_of_known_differences():
     def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, Finished]:
         offset = maps.expand(1, 2, 2, 2)
         found = Maps(None, center_B1HW=maps, offset_B2HW=offset, logits_BChw=logits)
-        found.inverse_B1HW = maps
-        return found, Finished(panoptic, depth_B1HW=depth)
+        found.inverse_B1HW = 1 / depth
+        return found, Finished(panoptic)
 
     found = agreement.Agreement()
     other = depth * torch.tensor([1, 1, 1, 1.5]).view(2, 2)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mtl_bench.engines.base import Maps
 from mtl_bench.engines.scene import Finished
+from mtl_bench.geometry import depth_from_inverse
 from mtl_bench.postprocess import DIVISOR
 
 LIMITS = {  # precision -> least share of equal panoptic pixels, largest median of relative depth
@@ -49,9 +50,11 @@ class Agreement:
             self._map(maps_a.center_B1HW, maps_b.center_B1HW)
             self._map(maps_a.offset_B2HW, maps_b.offset_B2HW)
             self.equal.append(equal_share(done_a.panoptic_BHW, done_b.panoptic_BHW))
-        if done_a.depth_B1HW is not None and done_b.depth_B1HW is not None:
+        if maps_a.inverse_B1HW is not None and maps_b.inverse_B1HW is not None:
             self._map(maps_a.inverse_B1HW, maps_b.inverse_B1HW)
-            off = done_b.depth_B1HW / done_a.depth_B1HW - 1
+            # before the scale, which is no number where no road is found
+            depth_a, depth_b = map(depth_from_inverse, (maps_a.inverse_B1HW, maps_b.inverse_B1HW))
+            off = depth_b / depth_a - 1
             self.median.append(float(off.abs().nan_to_num(torch.inf).median()))
             self.depth_max = _largest(self.depth_max, off)
 

@@ -36,7 +36,7 @@ class Setting:
 class Maps:
     """What post-processing starts from, float32; what the tasks lack is None. See model.Outputs."""
 
-    class_BHW: Tensor | None = None  # index of the largest logit, int64
+    class_BHW: Tensor | None = None  # index of the largest logit, uint8 (of plain int64)
     center_B1HW: Tensor | None = None
     offset_B2HW: Tensor | None = None  # pixels
     inverse_B1HW: Tensor | None = None

@@ -33,9 +33,9 @@ class Upsample:
         return F.interpolate(maps_BChw.float(), self.size, mode="bilinear", align_corners=True)
 
     def classes(self, logits_BChw: Tensor) -> Tensor:
-        """Index [B,H,W] (int64) of the largest of the interpolated logits; of equals the first."""
+        """Index [B,H,W] (uint8) of the largest of the interpolated logits; of equals the first."""
         if logits_BChw.device.type == "cuda":  # has the bandwidth, and would wait for the host
-            return self.values(logits_BChw).argmax(1)
+            return self.values(logits_BChw).argmax(1).to(torch.uint8)
         return torch.stack([self._classes(logits_Chw) for logits_Chw in logits_BChw.float()])
 
     def _classes(self, logits_Chw: Tensor) -> Tensor:
@@ -53,7 +53,7 @@ class Upsample:
             row_P1m, column_Pm = self._down_Ph[:, None, i_m], self._right_Pw[:, j_m]
             at_PPm = row_P1m * self.size[1] + column_Pm
             flat_N.scatter_(0, at_PPm.flatten(), class_PPm.flatten())
-        return result_HW.long()
+        return result_HW
 
     def _cells(self, logits_Chw: Tensor, i_m: Tensor, j_m: Tensor) -> Tensor:
         """Logits [C,P,P,m] of all pixels of cells; cells last, so that every step is vectorised."""
