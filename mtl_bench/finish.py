@@ -7,6 +7,7 @@ Shapes: H x W pixels, C classes.
 from torch import Tensor, nn
 
 from mtl_bench import config
+from mtl_bench.geometry import depth_from_inverse
 from mtl_bench.postprocess import back_project, classes, dgc_scale, find_centers, group, member
 
 
@@ -62,7 +63,7 @@ class Finish(nn.Module):
         if inverse_11HW is not None:
             assert K_133 is not None
             assert camera_height_m_1 is not None
-            depth_11HW = inverse_11HW.float().clamp(min=1e-6).reciprocal()
+            depth_11HW = depth_from_inverse(inverse_11HW.float())
             road_1HW = None if class_1HW is None else class_1HW == self.road
             scale_1, _ = dgc_scale(
                 depth_11HW, K_133, camera_height_m_1, road_1HW, pitch_rad_B=pitch_rad_1

@@ -28,7 +28,6 @@ CLAIMED = 75  # exit code of a cell that another process runs
 INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a cell that was told to stop
 POLL_S = 0.2
 GRACE_S = 30.0  # for a cell to save its state after Ctrl-C
-RERUN = ("stale", "failed", "all", "latency")
 
 Command = Callable[[Cell], Sequence[str]]
 

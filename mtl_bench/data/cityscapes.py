@@ -29,11 +29,11 @@ from mtl_bench.data.labels import CITYSCAPES20, LabelSet
 from mtl_bench.data.targets import OUTSIDE, panoptic_targets
 
 NOT_REPROJECTED = torch.tensor([files.EGO_ID, files.SKY_ID, OUTSIDE])
-_PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
+PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
 
 
 @dataclass(frozen=True)
-class _Frame:
+class DecodedFrame:
     """What is kept of a decoded frame; everything random comes later."""
 
     images_N3HW: Sequence[Tensor]  # uint8, input size; in training followed by previous and next
@@ -84,8 +84,8 @@ class Cityscapes:
         self.root, self.split, self.data, self.labels = root, split, data, labels
         self.video, self.panoptic, self.loss = video, panoptic, loss
         self.sequence_labels = sequence_labels
-        self._augment = augment or _PLAIN
-        self._cache: dict[tuple[int, bool], _Frame] | None = {} if data.cache else None
+        self._augment = augment or PLAIN
+        self._cache: dict[tuple[int, bool], DecodedFrame] | None = {} if data.cache else None
         self.on_disk = FrameCache(root, data, self._to_input)
         self.names = files.annotated_names(root, split)
         self._annotated = frozenset(self.names)
@@ -151,7 +151,7 @@ class Cityscapes:
 
     # --- samples ----------------------------------------------------------------------------------
 
-    def _evaluation_sample(self, name: str, frame: _Frame) -> Batch:
+    def _evaluation_sample(self, name: str, frame: DecodedFrame) -> Batch:
         return Batch(
             names=[name],
             image_B3HW=frame.images_N3HW[0].contiguous().float() / 255,
@@ -162,7 +162,7 @@ class Cityscapes:
             depth_m_BHW=frame.depth_m,
         )
 
-    def _training_sample(self, name: str, frame: _Frame, generator: Generator) -> Batch:
+    def _training_sample(self, name: str, frame: DecodedFrame, generator: Generator) -> Batch:
         ids = frame.instance_ids
         if ids is None:  # no label file: unlabeled everywhere, so that padding can still be marked
             ids = torch.zeros(frame.images_N3HW[0].shape[-2:], dtype=torch.int32)
@@ -191,7 +191,7 @@ class Cityscapes:
 
     # --- decoding ---------------------------------------------------------------------------------
 
-    def _read(self, name: str, training: bool) -> _Frame:
+    def _read(self, name: str, training: bool) -> DecodedFrame:
         path = self._image_file(name)
         images = [self.on_disk.read(path, frame_cache.IMAGE)]
         own_size = images[0].own_size
@@ -219,7 +219,7 @@ class Cityscapes:
             depth_m = files.read_depth_m(depth_path, camera)
             files.check_same_size(depth_path, depth_m.shape, *frame)
 
-        return _Frame(
+        return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
             K_33=scale(K, self.data.width / own_size[1], self.data.height / own_size[0]),
             camera_height_m=camera.height_m,

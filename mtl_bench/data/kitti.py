@@ -19,7 +19,7 @@ from mtl_bench.data import frame_cache, velodyne
 from mtl_bench.data import kitti_files as files
 from mtl_bench.data import kitti_splits as splits
 from mtl_bench.data.augment import scale
-from mtl_bench.data.cityscapes import _PLAIN, Cityscapes, _Frame
+from mtl_bench.data.cityscapes import PLAIN, Cityscapes, DecodedFrame
 from mtl_bench.data.cityscapes_files import check_same_size, read_instance_ids
 from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.kitti_splits import Frame
@@ -78,8 +78,8 @@ class Kitti(Cityscapes):
     ) -> None:
         self.root, self.split, self.data, self.labels = root, split, data, labels
         self.video, self.panoptic, self.loss = video, panoptic, loss
-        self._augment, self._ego_mask = augment or _PLAIN, None
-        self._cache: dict[tuple[int, bool], _Frame] | None = {} if data.cache else None
+        self._augment, self._ego_mask = augment or PLAIN, None
+        self._cache: dict[tuple[int, bool], DecodedFrame] | None = {} if data.cache else None
         self.on_disk = FrameCache(root, data, self._to_input)
         self.tree = files.Tree(root)
         self.left_out: Counter[str] = Counter()
@@ -193,7 +193,7 @@ class Kitti(Cityscapes):
 
     # --- decoding ---------------------------------------------------------------------------------
 
-    def _read(self, name: str, training: bool) -> _Frame:
+    def _read(self, name: str, training: bool) -> DecodedFrame:
         frame = self._frames[name]
         path = self.tree.image(frame)
         camera = self._cameras[frame.date, frame.camera]
@@ -207,7 +207,7 @@ class Kitti(Cityscapes):
         ids = self._read_labels(frame, path, size, training)
         depth_m = self._read_depth_m(frame, path, camera) if self.video and not training else None
         K_33 = torch.from_numpy(camera.K_33).float()
-        return _Frame(
+        return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
             K_33=scale(K_33, self.data.width / size[1], self.data.height / size[0]),
             camera_height_m=files.CAMERA_HEIGHT_M,

@@ -44,25 +44,35 @@ class Maps:
 
 
 class InferenceEngine(ABC):
-    """Base of every engine: subclasses say how the graph of `graph.Strided` is run.
+    """Base of every engine.
 
     Args:
         net: a model's `net` in evaluation mode, on the setting's device.
-        setting: what the graph is made for.
+        setting: what the engine is made for.
     """
 
     package: ClassVar[str] = "torch"  # its version stands in the row
 
     def __init__(self, net: nn.Module, setting: Setting):
         self.setting = setting
-        self._upsample: Upsample | None = None
 
     def transfer(self, image_BHW3: Tensor) -> Any:
         """8-bit RGB from host memory to where the network runs."""
         return image_BHW3.to(self.setting.device, non_blocking=True)
 
+    @abstractmethod
     def network(self, image: Any) -> Maps:
         """What `transfer` returned -> maps of the image's size; the next call may reuse them."""
+
+
+class StridedEngine(InferenceEngine):
+    """Base of engines that run the graph of `graph.Strided`: subclasses say how."""
+
+    def __init__(self, net: nn.Module, setting: Setting):
+        super().__init__(net, setting)
+        self._upsample: Upsample | None = None
+
+    def network(self, image: Any) -> Maps:
         maps = self.strided(image)
         first = next(iter(maps.values()))
         if self._upsample is None:

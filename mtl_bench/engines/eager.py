@@ -2,11 +2,11 @@
 
 from torch import Tensor, nn
 
-from mtl_bench.engines.base import InferenceEngine, Setting
+from mtl_bench.engines.base import Setting, StridedEngine
 from mtl_bench.engines.graph import strided
 
 
-class Eager(InferenceEngine):
+class Eager(StridedEngine):
     def __init__(self, net: nn.Module, setting: Setting):
         super().__init__(net, setting)
         self.graph = strided(net, (setting.batch, *setting.size), setting.dtype)

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from mtl_bench.engines import onnx_file
-from mtl_bench.engines.base import InferenceEngine, Setting
+from mtl_bench.engines.base import Setting, StridedEngine
 from mtl_bench.engines.graph import strided
 
 
-class OnnxRuntime(InferenceEngine):
+class OnnxRuntime(StridedEngine):
     package = "onnxruntime"
 
     def __init__(self, net: nn.Module, setting: Setting):

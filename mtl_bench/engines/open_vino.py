@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.engines.base import InferenceEngine, Setting
+from mtl_bench.engines.base import Setting, StridedEngine
 from mtl_bench.engines.onnx_runtime import write_strided
 
 HINTS = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
 
 
-class OpenVino(InferenceEngine):
+class OpenVino(StridedEngine):
     """Raises:
     ValueError: this CPU does not compute in the precision.
     """

@@ -24,6 +24,3 @@ class Plain(InferenceEngine):
             inverse_B1HW=out.inverse_depth[0] if out.inverse_depth else None,
             logits_BChw=logits_BCHW,
         )
-
-    def strided(self, image: Tensor) -> dict[str, Tensor]:
-        raise NotImplementedError("the network's own forward pass has no strided maps")

@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.engines.base import InferenceEngine, Setting
+from mtl_bench.engines.base import Setting, StridedEngine
 from mtl_bench.engines.onnx_runtime import write_strided
 
 FLAGS = {"fp32": (), "bf16": ("BF16",), "fp16": ("FP16",)}
 
 
-class TensorRt(InferenceEngine):
+class TensorRt(StridedEngine):
     """Raises:
     ValueError: TensorRT cannot read the graph or build it.
     """
