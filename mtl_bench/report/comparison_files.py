@@ -5,20 +5,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import pandas as pd
-from markupsafe import Markup
 
 from mtl_bench.report import formats
 from mtl_bench.report.comparison import Comparison
 from mtl_bench.report.groups import Entry
 from mtl_bench.report.lines import NOTHING, Line
-from mtl_bench.report.page import TEMPLATE as GRID_PAGE
+from mtl_bench.report.page import template
 from mtl_bench.report.published import NUMBERS, TEXTS
 
 LONG = 46  # characters of a method with its details: longer ones are broken in LaTeX
 TEMPLATE = "comparison.html.j2"
-SHARED = ("style", "script")  # elements of a grid's page that this one has, too
 TITLES_TEX = {f"delta{i}": rf"$\delta_{i}$" for i in (1, 2, 3)}
 SQUARES_TEX = {"1.25^2": "$1.25^2$", "1.25^3": "$1.25^3$"}
 
@@ -113,22 +110,11 @@ def latex(table: Comparison) -> str:
 
 def page(table: Comparison, command: str) -> str:
     """One HTML file that needs nothing but itself, in the style of a grid's page."""
-    folder = Path(__file__).parent
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    other = (folder / GRID_PAGE).read_text(encoding="utf-8")
-    shared = {tag: Markup(other.split(f"<{tag}>")[1].split(f"</{tag}>")[0]) for tag in SHARED}
     names = columns(table)
     heads = [(title(table, name), note(name), name in TEXTS) for name in names]
     values = {"names": names, "heads": heads, "sources": sources(table), "texts": TEXTS}
-    template = environment.get_template(TEMPLATE)
-    return template.render(
-        table=table, command=command, halves=halves, f=formats, **values, **shared
+    return template(TEMPLATE).render(
+        table=table, command=command, halves=halves, f=formats, **values
     )
 
 

@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import pandas as pd
-from markupsafe import Markup
 
 from mtl_bench.report import formats, page
 from mtl_bench.report.columns import Column, flatten
@@ -24,7 +22,6 @@ from mtl_bench.report.tables import published
 
 TEMPLATE = "latency.html.j2"
 SCIENTIFIC = ("depth_rel", "logits_max")  # differences over many orders of magnitude
-SHARED = ("style", "script")  # elements of a training grid's page that this one has, too
 LEFT = range(len(IDENTITY))  # columns of words
 AXIS = "latency"  # of the published lists that stand beside it
 PUBLISHED = {
@@ -140,18 +137,8 @@ def html(
     command: str,
 ) -> str:
     """The page; the figures' files are read from `out_dir`."""
-    folder = Path(__file__).parent
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(folder),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    other = (folder / page.TEMPLATE).read_text(encoding="utf-8")
-    shared = {tag: Markup(other.split(f"<{tag}>")[1].split(f"</{tag}>")[0]) for tag in SHARED}
     states = [line.status for line in table.lines]
-    rendered = environment.get_template(TEMPLATE).render(
+    rendered = page.template(TEMPLATE).render(
         grid=grid,
         table=table,
         states=", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states)),
@@ -170,7 +157,6 @@ def html(
         command=command,
         smoke=SMOKE,
         f=formats,
-        **shared,
     )
     return rendered + "\n"
 

@@ -52,6 +52,18 @@ class Figure:
     caption: str
 
 
+def template(name: str) -> jinja2.Template:
+    """A page's template of this folder; all pages include the same style and script."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template(name)
+
+
 def render(
     grid: Any,
     table: Table,
@@ -61,16 +73,9 @@ def render(
     out_dir: Path,
 ) -> str:
     """The page's HTML; the figures' files are read from `out_dir`."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
     drawn = [(figure, inline(out_dir, figure)) for figure in figures]
     return (
-        environment.get_template(TEMPLATE).render(
+        template(TEMPLATE).render(
             grid=grid,
             recipe=getattr(grid.recipe, "name", grid.recipe),
             table=table,
