@@ -24,7 +24,7 @@ from mtl_bench import postprocess
 from mtl_bench.config import Evaluate
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.finish import Finish
-from mtl_bench.geometry import depth_from_inverse
+from mtl_bench.geometry import back_project, depth_from_inverse
 from mtl_bench.grouping import nearest
 
 COUNTS = (5, 50, 200)
@@ -70,7 +70,7 @@ def scene(instances: int, height: int = 1024, width: int = 2048, seed: int = 0) 
 
 
 def finish() -> Finish:
-    return Finish(THINGS, ROAD, (EGO, SKY), Evaluate())
+    return Finish(THINGS, ROAD, Evaluate(), (EGO, SKY))
 
 
 def steps(inputs: Inputs, settings: Evaluate) -> dict[str, Callable[[], object]]:
@@ -95,7 +95,7 @@ def steps(inputs: Inputs, settings: Evaluate) -> dict[str, Callable[[], object]]
         "- nearest": lambda: nearest(point_2N, image_N, centers, count, size),
         "(table)": lambda: nearest_by_table(point_2N, centers[0]),
         "DGC scale": lambda: postprocess.dgc_scale(*scaling),
-        "points": lambda: postprocess.back_project(depth, K),
+        "points": lambda: back_project(depth, K),
         "whole": lambda: whole(*inputs),
     }
 

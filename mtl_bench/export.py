@@ -134,7 +134,7 @@ def export(
 def _finish(labels: LabelSet, evaluate: config.Evaluate) -> Finish:
     known = [label.name for label in labels.labels]
     without = tuple(labels.index(name) for name in EGO_AND_SKY if name in known)
-    return Finish(labels.things, labels.index("road"), without, evaluate).eval()
+    return Finish(labels.things, labels.index("road"), evaluate, without).eval()
 
 
 def _camera(names: list[str], size: tuple[int, int]) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ SLACK = 1e-3  # pixels: a projection this far outside the image is rounding, not
 
 def depth_from_inverse(inverse_B1HW: Tensor) -> Tensor:
     """Depth of an inverse depth, at most 1e6."""
-    return 1.0 / inverse_B1HW.clamp(min=1e-6)
+    return inverse_B1HW.clamp(min=1e-6).reciprocal()
 
 
 def scale_intrinsics(K_B33: Tensor, scale_x: float, scale_y: float) -> Tensor:
@@ -49,9 +49,13 @@ def pose_from_vector(vector_B6: Tensor) -> Tensor:
 
 
 def back_project(depth_B1HW: Tensor, K_B33: Tensor) -> Tensor:
-    """Points [B,3,H,W] in the camera's frame that are seen at these depths."""
-    rays = _inverse(K_B33) @ _pixels(depth_B1HW)
-    return rays.unflatten(-1, depth_B1HW.shape[-2:]) * depth_B1HW
+    """Points [B,3,H,W] in the camera's frame that are seen at these depths; NaN without one."""
+    height, width = depth_B1HW.shape[-2:]
+    y_H1 = torch.arange(height, device=K_B33.device, dtype=K_B33.dtype)[:, None]
+    x_1W = torch.arange(width, device=K_B33.device, dtype=K_B33.dtype)[None]
+    fx, fy, cx, cy = (K_B33[:, i, j, None, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    z_B1HW = depth_B1HW.masked_fill(depth_B1HW <= 0, torch.nan)
+    return torch.cat([(x_1W - cx) / fx * z_B1HW, (y_H1 - cy) / fy * z_B1HW, z_B1HW], 1)
 
 
 def project(points_B3HW: Tensor, K_B33: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,6 +19,8 @@ import math
 import torch
 from torch import Tensor
 
+from mtl_bench import pixels
+
 CELLS = 2**11  # as many cover an image whose centers are all over it
 RINGS = 5  # each of RING x RING cells, GROWTH times as wide as the last one's
 RING, GROWTH = 16, 8
@@ -135,15 +137,16 @@ def _candidates(
     apart_BKK = (center_BK2[:, :, None] - center_BK2[:, None]).abs().sum(3)
     first_B1 = torch.arange(images, device=near_BM.device)[:, None] * K
     apart_BMK = apart_BKK.flatten(0, 1).index_select(0, (near_BM + first_B1).view(-1))
-    reach_BMK = apart_BMK.view_as(distance_BMK) * side_M1
-    may_BMK = distance_BMK * (1 - ROUNDING) - reach_BMK <= least_BM1
+    apart_BMK = apart_BMK.view_as(distance_BMK)
+    more = 1 / (1 - ROUNDING)
+    may_BMK = distance_BMK <= torch.addcmul(least_BM1 * more, apart_BMK, side_M1 * more)
     may_BMK = torch.cat([may_BMK, may_BMK.new_ones(images, 1, K)], 1)  # far out: anyone
     near_BM = torch.cat([near_BM, near_BM.new_zeros(images, 1)], 1)
 
     length_BM = may_BMK.sum(2)
     several_BM = (length_BM > 1) & (count_B > 0)[:, None]
-    cell_L, index_L = may_BMK.view(-1, K).nonzero(as_tuple=True)
-    entry_L = cell_L // may_BMK.shape[1] * K + index_L
+    at_L = pixels.where(may_BMK)
+    entry_L = at_L // (may_BMK.shape[1] * K) * K + at_L % K
     return near_BM.masked_fill(several_BM, -1).view(-1), length_BM.view(-1), entry_L
 
 

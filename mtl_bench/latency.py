@@ -22,11 +22,12 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from mtl_bench import config, geometry, postprocess
+from mtl_bench import config, geometry
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.engine import Engine
 from mtl_bench.evaluate import evaluating
+from mtl_bench.finish import Finish
 from mtl_bench.provenance import cpu_model
 
 STAGES = ("transfer", "network", "postprocess")
@@ -137,6 +138,7 @@ def _stages(
     """The three timed functions, each fed with the one before's result."""
     K_133 = K_133.to(engine.device)
     height_m_1 = torch.tensor([camera_height_m], device=engine.device)
+    finish = Finish(things, road, evaluate)
     layout = torch.channels_last if engine.channels_last else torch.contiguous_format
 
     def transfer(host: Tensor) -> Tensor:
@@ -147,21 +149,14 @@ def _stages(
         with engine.autocast():
             return model.net(image_13HW)  # type: ignore[operator]
 
-    def finish(out: Any) -> tuple[Tensor | None, Tensor | None]:
-        panoptic_1HW = road_1HW = depth_m_11HW = None
-        if out.semantic_BCHW is not None:
-            class_1HW = out.semantic_BCHW.argmax(1)
-            road_1HW = class_1HW == road
-            panoptic_1HW = postprocess.panoptic(
-                class_1HW, out.center_B1HW, out.offset_B2HW, things, evaluate
-            )
-        if out.inverse_depth:
-            depth_11HW = geometry.depth_from_inverse(out.inverse_depth[0].float())
-            scale_1, _ = postprocess.dgc_scale(depth_11HW, K_133, height_m_1, road_1HW)
-            depth_m_11HW = depth_11HW * scale_1.view(-1, 1, 1, 1)
-        return panoptic_1HW, depth_m_11HW
+    def last(out: Any) -> dict[str, Tensor]:
+        inverse = out.inverse_depth[0] if out.inverse_depth else None
+        found: dict[str, Tensor] = finish(
+            out.semantic_BCHW, out.center_B1HW, out.offset_B2HW, inverse, K_133, height_m_1
+        )
+        return found
 
-    return [transfer, network, finish]
+    return [transfer, network, last]
 
 
 def time_pass(stages: list[Stage], host: Tensor, device: torch.device) -> list[float]:

@@ -13,18 +13,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mtl_bench import config
+from mtl_bench import config, pixels
 from mtl_bench.data.labels import IGNORE, LabelSet
 from mtl_bench.depth_scale import DGC_SOURCES, FAILED, NORMALS, ROAD, dgc_scale
 from mtl_bench.grouping import nearest
 from mtl_bench.model.network import Outputs
 
 __all__ = ["DGC_SOURCES", "FAILED", "NORMALS", "ROAD", "dgc_scale", "find_centers"]
-__all__ += ["back_project", "classes", "group", "member", "panoptic", "resize", "to_instance_ids"]
+__all__ += ["classes", "group", "member", "panoptic", "resize", "to_instance_ids"]
 
 DIVISOR = 1000
 VOID = -1
-STRIP = 64  # rows
 
 
 def resize(outputs: Outputs, height: int, width: int) -> Outputs:
@@ -47,19 +46,6 @@ def resize(outputs: Outputs, height: int, width: int) -> Outputs:
         offset_B2HW=offset,
         inverse_depth=[to(inverse) for inverse in outputs.inverse_depth],
     )
-
-
-def back_project(depth_m_B1HW: Tensor, K_B33: Tensor) -> Tensor:
-    """Points [B,3,H,W] in the camera's frame (x right, y down, z forward); NaN where depth is not.
-
-    geometry.back_project for intrinsics without skew, in a third of the time.
-    """
-    height, width = depth_m_B1HW.shape[2:]
-    y_H1 = torch.arange(height, device=K_B33.device, dtype=K_B33.dtype)[:, None]
-    x_1W = torch.arange(width, device=K_B33.device, dtype=K_B33.dtype)[None]
-    fx, fy, cx, cy = (K_B33[:, i, j, None, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    z_B1HW = depth_m_B1HW.masked_fill(depth_m_B1HW <= 0, torch.nan)
-    return torch.cat([(x_1W - cx) / fx * z_B1HW, (y_H1 - cy) / fy * z_B1HW, z_B1HW], 1)
 
 
 # --- instances ------------------------------------------------------------------------------------
@@ -112,7 +98,7 @@ def find_centers(center_B1HW: Tensor, ev: config.Evaluate) -> tuple[Tensor, Tens
         raise ValueError(f"evaluate.nms_kernel must be odd, not {ev.nms_kernel}")
     heat_B1HW = center_B1HW.float()
     images, _, height, width = heat_B1HW.shape
-    pixel_P = _peaks(heat_B1HW, ev.nms_kernel, ev.center_threshold).flatten().nonzero()[:, 0]
+    pixel_P = pixels.where(pixels.peaks(heat_B1HW, ev.nms_kernel, ev.center_threshold))
     height_P = heat_B1HW.flatten().index_select(0, pixel_P)
     in_image_BP = (
         pixel_P // (height * width) == torch.arange(images, device=pixel_P.device)[:, None]
@@ -150,11 +136,12 @@ def group(
     """`panoptic` from `classes` and the centers on; int32. What exported graphs contain."""
     images, height, width = class_BHW.shape
     K, device = centers_BK2.shape[1], class_BHW.device
-    row_N, column_N = member(class_BHW, things).view(-1, width).nonzero(as_tuple=True)
-    pixel_N = row_N * width + column_N
-    image_N, y_N = torch.zeros_like(row_N), row_N
+    pixel_N = pixels.where(member(class_BHW, things))
+    row_N = torch.div(pixel_N.int(), width, rounding_mode="trunc")
+    column_N = pixel_N.int() - row_N * width
+    image_N, y_N = torch.zeros_like(pixel_N), row_N
     if images > 1:
-        image_N, y_N = row_N // height, row_N % height
+        image_N, y_N = row_N.long() // height, row_N % height
     target_2N = torch.stack(
         [
             own_N.float() + offset_B2HW[:, axis].flatten().index_select(0, pixel_N).float()
@@ -196,39 +183,6 @@ def to_instance_ids(panoptic_BHW: Tensor, labels: LabelSet) -> Tensor:
     return torch.where(numbered_BHW, label_BHW * DIVISOR + instance_BHW, label_BHW).int()
 
 
-def _peaks(heat_B1HW: Tensor, kernel: int, threshold: float) -> Tensor:
-    """Where a pixel is above the threshold and nothing in its window is above it.
-
-    On the CPU in strips that the cache holds.
-    """
-    half, height = kernel // 2, heat_B1HW.shape[2]
-    strip = height if torch.compiler.is_exporting() else STRIP
-    parts = []
-    for first in range(0, height, strip):
-        last = min(first + strip, height)
-        top, bottom = max(first - half, 0), min(last + half, height)
-        border = (half, half, half - first + top, half - bottom + last)
-        around = F.pad(heat_B1HW[:, :, top:bottom], border, value=-torch.inf)
-        own = heat_B1HW[:, :, first:last]
-        parts.append((own == _highest(around, kernel)) & (own > threshold))
-    return torch.cat(parts, 2)
-
-
-def _highest(x_B1HW: Tensor, kernel: int) -> Tensor:
-    """Maximum of the window right of and below each pixel: of twice the length until it is enough.
-
-    On the CPU a tenth of what max_pool2d takes.
-    """
-    for axis in (2, 3):
-        length = 1
-        while length < kernel:
-            shift = min(length, kernel - length)
-            rest = x_B1HW.shape[axis] - shift
-            x_B1HW = torch.maximum(x_B1HW.narrow(axis, 0, rest), x_B1HW.narrow(axis, shift, rest))
-            length += shift
-    return x_B1HW
-
-
 def member(class_BHW: Tensor, classes: tuple[int, ...]) -> Tensor:
     """Where the class is one of these: a comparison or two for each run of neighbours."""
     runs: list[list[int]] = []
@@ -250,17 +204,12 @@ def _stuff(class_BHW: Tensor, things: tuple[int, ...], least: int) -> Tensor:
     """Ids without instances: VOID where a stuff class covers too little of its image, or none."""
     if torch.compiler.is_exporting():
         return _stuff_by_class(class_BHW, things, least)
-    images, device, width = len(class_BHW), class_BHW.device, IGNORE + 1
-    row, flat = class_BHW.flatten().int(), class_BHW.flatten()
-    if images > 1:
-        image_B1 = torch.arange(images, device=device, dtype=torch.int32)[:, None] * width
-        row = flat = (row.view(images, -1) + image_B1).flatten()
-    area_BC = torch.bincount(flat, minlength=images * width).view(-1, width)
-    least_C = [0 if c in things else least for c in range(IGNORE)]
-    keep_BC = area_BC >= torch.tensor([*least_C, len(row) + 1], device=device)
-    id_C = torch.arange(width, device=device, dtype=torch.int32) * DIVISOR
-    id_BC = id_C.masked_fill(~keep_BC, VOID)
-    return id_BC.flatten().index_select(0, row).view_as(class_BHW)
+    device = class_BHW.device
+    least_V = [0 if c in things else least for c in range(IGNORE)]
+    none = class_BHW[0].numel() + 1  # no area is as large
+    keep_BV = pixels.areas(class_BHW) >= torch.tensor([*least_V, none], device=device)
+    id_V = torch.arange(len(least_V) + 1, device=device, dtype=torch.int32) * DIVISOR
+    return pixels.look_up(id_V.masked_fill(~keep_BV, VOID), class_BHW)
 
 
 def _stuff_by_class(class_BHW: Tensor, things: tuple[int, ...], least: int) -> Tensor:

@@ -17,7 +17,6 @@ from mtl_bench.engines.base import Maps, Setting
 from mtl_bench.engines.eager import Eager
 from mtl_bench.engines.folding import NORM, fold
 from mtl_bench.engines.graph import Body, strided
-from mtl_bench.engines.scene import Finished
 from mtl_bench.engines.upsample import Upsample
 
 CPU = torch.device("cpu")
@@ -219,11 +218,11 @@ def test_agreement_of_known_differences():
     panoptic = torch.tensor([[[1000, 1000], [1000, 2000]]])
     maps = torch.tensor([[[[1.0, 2], [4, 8]]]])
 
-    def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, Finished]:
+    def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, dict[str, Tensor]]:
         offset = maps.expand(1, 2, 2, 2)
         found = Maps(None, center_B1HW=maps, offset_B2HW=offset, logits_BChw=logits)
         found.inverse_B1HW = 1 / depth
-        return found, Finished(panoptic)
+        return found, {"panoptic": panoptic}
 
     found = agreement.Agreement()
     other = depth * torch.tensor([1, 1, 1, 1.5]).view(2, 2)

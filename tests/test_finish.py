@@ -18,7 +18,7 @@ NAMES = ("semantic", "center", "offset", "inverse", "K", "camera_height", "pitch
 
 
 def finish() -> Finish:
-    return Finish(THINGS, ROAD, (EGO, SKY), SETTINGS).eval()
+    return Finish(THINGS, ROAD, SETTINGS, (EGO, SKY)).eval()
 
 
 def inputs(seed: int, case: str = "plain") -> tuple[torch.Tensor, ...]:

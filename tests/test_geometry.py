@@ -77,8 +77,9 @@ def test_warp_is_projection_of_moved_points(K_133: Tensor, pose_144: Tensor) -> 
     image, depth = pattern(7, 13, 5, 17), 2 + pattern(1, 2, 0, 5, channels=1)
     points = geometry.back_project(depth, K_133)
     moved = pose_144[:, :3, :3] @ points.flatten(2) + pose_144[:, :3, 3:]
-    pixels, in_view = geometry.project(moved.view_as(points), K_133)
-    grid = pixels / torch.tensor([7.5, 5.5], dtype=F64) - 1
+    x, y, z = (K_133 @ moved).view_as(points)[0]
+    grid = torch.stack([x / z / 7.5 - 1, y / z / 5.5 - 1], -1)[None]
+    in_view = (grid.abs() <= 1 + 1e-9).all(-1)[:, None]
     expected = torch.nn.functional.grid_sample(image, grid, align_corners=True)
     warped, valid = geometry.warp(image, depth, pose_144, K_133)
     torch.testing.assert_close(warped, expected)
@@ -102,6 +103,21 @@ def test_project_inverts_back_project(K_133: Tensor) -> None:
     y, x = torch.meshgrid(torch.arange(12.0), torch.arange(16.0), indexing="ij")
     torch.testing.assert_close(pixels[0], torch.stack((x, y), -1).to(F64))
     assert in_view.all()
+
+
+def test_points_of_each_image_and_nan_where_there_is_no_depth(K_133: Tensor) -> None:
+    depth = 2 + torch.cat([pattern(1, 2, 0, 5, channels=1)] * 2)
+    K = K_133.repeat(2, 1, 1)
+    K[1, 0, 0] *= 2
+    points = geometry.back_project(depth, K)
+    alone = [geometry.back_project(depth[i : i + 1], K[i : i + 1]) for i in range(2)]
+    assert torch.equal(points, torch.cat(alone))
+    assert not torch.equal(*alone)
+    depth[0, 0, 3, 5], depth[1, 0, 0, 0] = 0.0, float("nan")
+    empty = geometry.back_project(depth, K).isnan()
+    assert empty.sum() == 6
+    assert empty[0, :, 3, 5].all()
+    assert empty[1, :, 0, 0].all()
 
 
 def test_out_of_view_and_behind_the_camera(K_133: Tensor) -> None:

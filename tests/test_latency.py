@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from mtl_bench import config, latency
+from mtl_bench import config, finish, latency
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.model import Outputs
@@ -201,16 +201,16 @@ def test_another_size_scales_image_and_intrinsics():
 @pytest.mark.parametrize("tasks", [("panoptic",), ("depth",), ("panoptic", "depth")])
 def test_only_the_tasks_present_are_finished(tasks, monkeypatch):
     calls = []
-    for name in ("panoptic", "dgc_scale"):
-        function = getattr(latency.postprocess, name)
+    for name in ("group", "dgc_scale"):
+        function = getattr(finish, name)
 
-        def spy(*args, name=name, function=function):
+        def spy(*args, name=name, function=function, **kwargs):
             calls.append(name)
-            return function(*args)
+            return function(*args, **kwargs)
 
-        monkeypatch.setattr(latency.postprocess, name, spy)
+        monkeypatch.setattr(finish, name, spy)
     result = measure(FakeModel(tasks))
-    assert ("panoptic" in calls) == ("panoptic" in tasks)
+    assert ("group" in calls) == ("panoptic" in tasks)
     assert ("dgc_scale" in calls) == ("depth" in tasks)
     assert result["latency.postprocess_ms"] > 0
 

@@ -18,7 +18,7 @@ LINES = 300
 # A module imports only from rooms before its own (or from its own).
 ORDER = (
     *("plain", "recipe", "config", "plugins", "cards", "provenance", "data", "geometry"),
-    *("depth_scale", "model", "grouping", "postprocess", "finish"),
+    *("depth_scale", "model", "pixels", "grouping", "postprocess", "finish"),
     *("losses", "method", "jacobian", "gradients", "weighting", "by_gradients", "backward"),
     "engine",
     *("checkpoint", "curve", "quiet", "progress", "tracking", "train"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtl_bench import config, depth_scale, geometry, postprocess
+from mtl_bench import config, depth_scale, postprocess
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE
 from mtl_bench.data.targets import panoptic_targets
 from mtl_bench.metrics.panoptic import PanopticQuality
@@ -116,14 +116,6 @@ def test_nothing_but_void():
     assert (result == postprocess.VOID).all()
 
 
-def test_a_window_over_several_strips(monkeypatch):
-    heat = torch.rand(2, 1, 23, 17, generator=torch.Generator().manual_seed(0))
-    whole = postprocess.find_centers(heat, settings(nms_kernel=7))
-    monkeypatch.setattr(postprocess, "STRIP", 2)
-    for a, b in zip(whole, postprocess.find_centers(heat, settings(nms_kernel=7)), strict=True):
-        assert torch.equal(a, b)
-
-
 def test_a_batch_is_its_images():
     generator = torch.Generator().manual_seed(0)
     classes = torch.randint(0, len(CITYSCAPES20), (5, 20, 30), generator=generator)
@@ -152,20 +144,6 @@ def test_members_may_be_any_classes():
         for dtype in (torch.uint8, torch.int32, torch.int64):
             found = postprocess.member(classes.to(dtype), chosen)
             assert found.nonzero()[:, 0].tolist() == sorted(chosen)
-
-
-def test_points_are_geometrys_and_nan_where_there_is_no_depth():
-    generator = torch.Generator().manual_seed(0)
-    depth = 1 + 50 * torch.rand(2, 1, 9, 16, generator=generator)
-    K = torch.tensor([[30.0, 0, 7], [0, 31, 4], [0, 0, 1]]).expand(2, 3, 3).clone()
-    K[1, 0, 0] = 40
-    points = postprocess.back_project(depth, K)
-    torch.testing.assert_close(points, geometry.back_project(depth, K))
-    depth[0, 0, 3, 5], depth[1, 0, 0, 0] = 0.0, math.nan
-    empty = postprocess.back_project(depth, K).isnan()
-    assert empty.sum() == 6
-    assert empty[0, :, 3, 5].all()
-    assert empty[1, :, 0, 0].all()
 
 
 def load_benchmark():

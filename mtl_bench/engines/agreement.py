@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mtl_bench.engines.base import Maps
-from mtl_bench.engines.scene import Finished
 from mtl_bench.geometry import depth_from_inverse
 from mtl_bench.postprocess import DIVISOR
 
@@ -35,12 +34,15 @@ class Agreement:
     median: list[float] = field(default_factory=list)  # of |depth / plain depth - 1|, an image
     depth_max: float = 0.0
 
-    def update(self, plain: tuple[Maps, Finished], other: tuple[Maps, Finished]) -> None:
-        """One image; what is not finite in `other` is never near to what is."""
+    def update(
+        self, plain: tuple[Maps, dict[str, Tensor]], other: tuple[Maps, dict[str, Tensor]]
+    ) -> None:
+        """One image: maps and what `finish.Finish` makes of them.
+
+        What is not finite in `other` is never near to what is.
+        """
         (maps_a, done_a), (maps_b, done_b) = plain, other
         if maps_a.logits_BChw is not None and maps_b.logits_BChw is not None:
-            assert done_a.panoptic_BHW is not None
-            assert done_b.panoptic_BHW is not None
             logits = maps_b.logits_BChw
             if logits.shape != maps_a.logits_BChw.shape:
                 size = maps_a.logits_BChw.shape[2:]
@@ -49,7 +51,7 @@ class Agreement:
             self._map(maps_a.logits_BChw, logits)
             self._map(maps_a.center_B1HW, maps_b.center_B1HW)
             self._map(maps_a.offset_B2HW, maps_b.offset_B2HW)
-            self.equal.append(equal_share(done_a.panoptic_BHW, done_b.panoptic_BHW))
+            self.equal.append(equal_share(done_a["panoptic"], done_b["panoptic"]))
         if maps_a.inverse_B1HW is not None and maps_b.inverse_B1HW is not None:
             self._map(maps_a.inverse_B1HW, maps_b.inverse_B1HW)
             # before the scale, which is no number where no road is found

@@ -6,8 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mtl_bench import config, geometry, postprocess
+from mtl_bench import config
 from mtl_bench.engines.base import Maps
+from mtl_bench.finish import Finish
 
 
 @dataclass(frozen=True)
@@ -53,46 +54,23 @@ class Subject:
         return self.images[0].shape[1], self.images[0].shape[2]
 
 
-@dataclass
-class Finished:
-    """What a pass ends with: `postprocess.panoptic`'s ids in 32 bits, and metres."""
-
-    panoptic_BHW: Tensor | None = None
-    depth_m_B1HW: Tensor | None = None
-
-
-class Finish:
-    """The last stage: grouping, and depth with its scale from the camera's height.
-
-    The lines are those of training rows (`latency`) and of evaluation, less copies: a full-size
-    map that is written once more takes a millisecond or two.
-    """
+class Last:
+    """The last stage of a pass: what a car needs of the maps, seen by this camera."""
 
     def __init__(self, subject: Subject, batch: int, device: torch.device):
-        self.subject, self.camera = subject, subject.camera.batch(batch, device)
+        self.finish = Finish(subject.things, subject.road, subject.evaluate)
+        self.camera = subject.camera.batch(batch, device)
 
-    def __call__(self, maps: Maps) -> Finished:
-        subject, camera, done, road_BHW = self.subject, self.camera, Finished(), None
-        if maps.class_BHW is not None:
-            assert maps.center_B1HW is not None
-            assert maps.offset_B2HW is not None
-            class_BHW = postprocess.classes(maps.class_BHW)
-            road_BHW = class_BHW == subject.road
-            done.panoptic_BHW = postprocess.group(
-                class_BHW,
-                *postprocess.find_centers(maps.center_B1HW, subject.evaluate),
-                maps.offset_B2HW,
-                subject.things,
-                subject.evaluate.stuff_area,
-            )
-        if maps.inverse_B1HW is not None:
-            depth_B1HW = geometry.depth_from_inverse(maps.inverse_B1HW)
-            scale_B, _ = postprocess.dgc_scale(
-                depth_B1HW,
-                camera.K_133,
-                camera.camera_height_m_1,
-                road_BHW,
-                pitch_rad_B=camera.pitch_rad_1,
-            )
-            done.depth_m_B1HW = depth_B1HW.mul_(scale_B.view(-1, 1, 1, 1))
-        return done
+    def __call__(self, maps: Maps) -> dict[str, Tensor]:
+        """`finish.Finish`'s results."""
+        camera = self.camera
+        found: dict[str, Tensor] = self.finish(
+            maps.class_BHW,
+            maps.center_B1HW,
+            maps.offset_B2HW,
+            maps.inverse_B1HW,
+            camera.K_133,
+            camera.camera_height_m_1,
+            camera.pitch_rad_1,
+        )
+        return found

@@ -24,7 +24,7 @@ from mtl_bench.engines import roofline
 from mtl_bench.engines.agreement import Agreement
 from mtl_bench.engines.base import InferenceEngine, Setting
 from mtl_bench.engines.noise import DRIFT, SPREAD
-from mtl_bench.engines.scene import Finish, Subject
+from mtl_bench.engines.scene import Last, Subject
 
 COMPARED = 4  # images that an engine is held against the plain network on
 WINDOW = 5  # passes: warm-up ends where the median of so many is not below that of those before
@@ -101,7 +101,7 @@ def _measured(
     wrong = agreement.wrong(setting.precision, subject.trained is not None)
     if wrong:
         return "wrong", f"{name} {setting.precision} differs from plain: {wrong}", metric
-    stages = [engine.transfer, engine.network, Finish(subject, 1, setting.device)]
+    stages = [engine.transfer, engine.network, Last(subject, 1, setting.device)]
     rounds = itertools.cycle(subject.images)
     warmup = warm_up(stages, rounds, setting.device, plan.seconds)
     gc.collect()
@@ -134,11 +134,11 @@ def compare(subject: Subject, engine: InferenceEngine, images: int = COMPARED) -
     """Hold an engine against the plain network, with float32 arithmetic, on the first images."""
     setting = engine.setting
     exact = Setting(1, *setting.size, "fp32", setting.device, setting.threads)
-    plain, finish = make(subject, "plain", exact), Finish(subject, 1, setting.device)
+    plain, last = make(subject, "plain", exact), Last(subject, 1, setting.device)
     agreement = Agreement()
     for image_1HW3 in subject.images[:images]:
         maps = [it.network(it.transfer(image_1HW3)) for it in (plain, engine)]
-        a, b = ((found, finish(found)) for found in maps)
+        a, b = ((found, last(found)) for found in maps)
         agreement.update(a, b)
     return agreement
 
@@ -189,7 +189,7 @@ def throughput(
     device = setting.device
     larger = Setting(plan.batch, *setting.size, setting.precision, device, plan.threads)
     engine = make(subject, name, larger)
-    stages: list[Any] = [engine.transfer, engine.network, Finish(subject, plan.batch, device)]
+    stages: list[Any] = [engine.transfer, engine.network, Last(subject, plan.batch, device)]
     source = itertools.cycle(subject.images)
     hosts = [torch.cat(list(itertools.islice(source, plan.batch))) for _ in range(2)]
     latency.time_pass(stages, hosts[0], device)
