@@ -67,6 +67,23 @@ def claim(directory: Path) -> Iterator[None]:
             path.unlink()
 
 
+def end_with_launcher() -> None:
+    """From now on end, as if interrupted, when the launcher that started this process has gone."""
+
+    def watch() -> None:
+        while not _orphan():
+            time.sleep(POLL_S)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    if LAUNCHER in os.environ:
+        threading.Thread(target=watch, daemon=True).start()
+
+
+def _orphan() -> bool:
+    launcher = os.environ.get(LAUNCHER)
+    return launcher is not None and os.getppid() != int(launcher)
+
+
 def _take(path: Path) -> None:
     for _ in range(3):
         try:
@@ -98,11 +115,9 @@ def _discard_void(path: Path) -> None:
 
 def _keep(path: Path, stop: threading.Event) -> None:
     """Renew the claim; interrupt this process when its launcher has gone or its claim is lost."""
-    launcher = os.environ.get(LAUNCHER)
     renewed = time.monotonic()
     while not stop.wait(POLL_S):
-        orphan = launcher is not None and os.getppid() != int(launcher)
-        if orphan or not _is_own(path):
+        if _orphan() or not _is_own(path):
             os.kill(os.getpid(), signal.SIGTERM)
             return
         if time.monotonic() - renewed > TOUCH_S:

@@ -297,6 +297,25 @@ def test_cells_end_with_a_launcher_that_was_killed(launcher, tmp_path):
     assert [results.status(cell, tmp_path) for cell in cells(2)] == ["interrupted"] * 2
 
 
+def test_any_process_ends_with_a_launcher_that_was_killed(tmp_path):
+    timing = (
+        "import pathlib, os, time\nfrom mtl_bench import claim\nclaim.end_with_launcher()\n"
+        f"pathlib.Path({str(tmp_path / 'pid')!r}).write_text(str(os.getpid()))\ntime.sleep(60)"
+    )
+    code = (
+        "import subprocess, sys\nfrom mtl_bench import launch\n"
+        f"subprocess.run([sys.executable, '-c', {timing!r}], env=launch.child_environment(1))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+    time.sleep(2 * claim.POLL_S)
+    assert process.poll() is None  # while the launcher lives, so does it
+    process.kill()
+    process.wait()
+    pid = int((tmp_path / "pid").read_text())
+    wait_for(lambda: not Path(f"/proc/{pid}").exists(), seconds=5)
+
+
 def test_an_interrupted_cell_is_no_failure(tmp_path):
     (cell,) = todo = cells(1)
     command = fake(tmp_path, seconds=60)

@@ -101,9 +101,10 @@ def latency(
     Its output is compared with the plain network's before. Without --data the built-in frames of
     the split val are looked at, resized to --size.
     """
-    from mtl_bench import results
+    from mtl_bench import claim, results
     from mtl_bench.engines import words
 
+    claim.end_with_launcher()
     if ALL in (engine, precision):
         rows = _all(engine, precision, device)
         for line in o.columns(words.table(rows)):
