@@ -28,6 +28,7 @@ HARNESS = (  # what numbers depend on; the rest launches, stores or shows
     "engine.py",
     "geometry.py",
     "depth_scale.py",
+    "pixels.py",
     "grouping.py",
     "postprocess.py",
     "finish.py",

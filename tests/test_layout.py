@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mtl_bench import plugins
+from mtl_bench import latency_runs, plugins, provenance
 
 PACKAGE = plugins.PACKAGE
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -88,6 +88,26 @@ def test_module(path):
     if path.parent != PACKAGE or path.stem != "__init__":
         known = ORDER[: ORDER.index(room(path)) + 1]
         assert imported_rooms(tree) <= set(known), "imports against the flow"
+
+
+# What modules that make numbers may use without being counted among them: names, files and words.
+AROUND = {"plain", "recipe", "config", "plugins", "provenance", "quiet", "progress", "checkpoint"}
+
+
+@pytest.mark.parametrize(
+    ("names", "others"),
+    [
+        (provenance.HARNESS, {"curve", "tracking"}),
+        # of a timing's network and frames only shapes count: training and data sets do not
+        (latency_runs.MEASURES, {"data", "evaluate", "export", "results", "stored"}),
+    ],
+    ids=["HARNESS", "MEASURES"],
+)
+def test_fingerprints_cover_all_that_numbers_depend_on(names, others):
+    rooms = {name.removesuffix(".py") for name in names}
+    paths = [path for path in MODULES if room(path) in rooms]
+    used = set().union(*(imported_rooms(ast.parse(path.read_text())) for path in paths))
+    assert used - rooms - others - AROUND == set()
 
 
 def literals(tree: ast.AST) -> set[str]:
