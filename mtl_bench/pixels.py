@@ -87,7 +87,7 @@ def _by_torch(map_: Tensor) -> bool:
 def _array(map_: Tensor) -> NDArray[Any]:
     """The map's own memory; OpenCV gets as many threads as torch has, which the user sets."""
     cv2.setNumThreads(torch.get_num_threads())
-    return map_.numpy()
+    return map_.detach().numpy()
 
 
 def _first(value_BHW: Tensor) -> Tensor:

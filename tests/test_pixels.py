@@ -84,3 +84,8 @@ def test_threads_are_torchs():
         torch.set_num_threads(threads)
         pixels.areas(torch.zeros(1, 4, 4, dtype=torch.uint8))
         assert cv2.getNumThreads() == threads
+
+
+def test_maps_that_need_gradients_are_read_as_well():
+    heat = torch.rand(1, 1, 5, 6, requires_grad=True)
+    assert pixels.peaks(heat, 3, 0.0).any()
