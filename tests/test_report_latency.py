@@ -117,7 +117,7 @@ def test_markdown_page_and_tex_have_a_table_for_each_size(built):
 
 def test_readme_has_the_largest_size_and_all_tasks_only(built, tmp_path):
     text = built.text["readme.md"]
-    assert text.startswith("1024x2048, panoptic, depth, batch 1:")
+    assert text.startswith("1024x2048, panoptic, depth, batch 1; plain and the fastest engine")
     assert "| resnet18 | panoptic |" not in text
     assert "tensorrt is unavailable: tensorrt is not installed: pip install" in text
     path = tmp_path / "README.md"
@@ -125,6 +125,26 @@ def test_readme_has_the_largest_size_and_all_tasks_only(built, tmp_path):
     assert readme.update(path, "latency", built.out)
     assert "pq_fps.png" in path.read_text()
     assert "rmse_fps.png" in path.read_text()
+
+
+def test_readme_has_plain_and_the_fastest_engine_of_each_precision():
+    rows = [
+        fake_latency.make_row(engine, precision=precision, backbone=backbone, mean_ms=ms)
+        for backbone in ("resnet18", "tiny_one")
+        for engine, precision, ms in (
+            ("plain", "fp32", 100.0),
+            ("eager", "fp32", 80.0),
+            ("openvino", "fp32", 60.0 if backbone == "tiny_one" else 90.0),
+            ("eager", "bf16", 30.0),
+            ("openvino", "bf16", 25.0),
+        )
+    ]
+    lines = latency_files.readme(tabulate(rows)).splitlines()
+    shown = [line.split(" | ") for line in lines if line.startswith(("| resnet18", "| tiny_one"))]
+    assert [(line[2], line[3]) for line in shown] == [
+        *(("plain", "fp32"), ("eager", "fp32"), ("openvino", "bf16")),
+        *(("plain", "fp32"), ("openvino", "fp32"), ("openvino", "bf16")),
+    ]
 
 
 # --- what has no numbers --------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from mtl_bench.report.groups import SMOKE, text
 from mtl_bench.report.latency_table import (
     COLUMNS,
     IDENTITY,
+    REFERENCE,
     SHORT,
     LatencyTable,
     Line,
@@ -97,14 +98,16 @@ def markdown(table: LatencyTable) -> str:
 
 
 def readme(table: LatencyTable) -> str:
-    """The main columns of the largest size that was measured, all tasks."""
+    """The main columns of the largest size that was measured, all tasks: of each backbone the
+    reference and the fastest engine of each precision."""
     shown = table.measured or list(table.lines)
     size = max((line.size for line in shown), key=_pixels)
     tasks = max((line.row["tasks"] for line in shown), key=len)
     lines = [line for line in table.of(size) if line.row["tasks"] == tasks]
     columns = [column for column in table.columns() if column.name in SHORT]
     parts = [f"**{SMOKE.capitalize()}.**"] * table.smoke
-    parts += [f"{size}, {text(tasks)}, batch 1:", _grid(lines, columns)]
+    what = f"{REFERENCE} and the fastest engine of each precision"
+    parts += [f"{size}, {text(tasks)}, batch 1; {what}:", _grid(_fastest(lines), columns)]
     lacking = [f"{engine} is {status}: {why}" for status, engine, _, why in without_numbers(table)]
     parts.append("\n".join(f"- {words}" for words in [*dict.fromkeys(lacking), *notes(table)[:1]]))
     return "\n\n".join(parts) + "\n"
@@ -162,6 +165,17 @@ def html(
 
 
 # --- parts ----------------------------------------------------------------------------------------
+
+
+def _fastest(lines: Sequence[Line]) -> list[Line]:
+    """Of each backbone's lines the reference's, and the least mean of each precision."""
+    best: dict[tuple[str, str], Line] = {}
+    for line in filter(lambda line: line.shown, lines):
+        key = (line.names[0], line.names[3])
+        if key not in best or line.values["mean_ms"] < best[key].values["mean_ms"]:
+            best[key] = line
+    chosen = [line for line in lines if line.engine == REFERENCE or line in best.values()]
+    return chosen or list(lines)
 
 
 def names_of(line: Line) -> list[str]:
