@@ -1,8 +1,10 @@
 """The README's examples are run, and its generated parts are the reference report's."""
 
+import io
 import re
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -44,10 +46,31 @@ def test_every_linked_file_exists():
         assert (README.parent / target).exists(), target
 
 
+def changed(path):
+    """Whether a file or folder is not as it was committed; False where git does not know."""
+    words = ["git", "status", "--porcelain", "--", path]
+    return bool(subprocess.run(words, cwd=README.parent, capture_output=True).stdout)
+
+
+@pytest.fixture(scope="module")
+def committed(tmp_path_factory):
+    """A folder with README and reports of the last commit."""
+    words = ["git", "archive", "HEAD", "README.md", "reports"]
+    found = subprocess.run(words, cwd=README.parent, capture_output=True, check=True).stdout
+    folder = tmp_path_factory.mktemp("committed")
+    with tarfile.open(fileobj=io.BytesIO(found)) as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
 @pytest.mark.parametrize("name", readme.names(README))
-def test_the_results_are_the_reference_reports(name):
-    text = readme.filled(README, name, README.parent / "reports" / name)
-    assert text == README.read_text("utf-8"), "make readme"
+def test_the_results_are_the_reference_reports(name, request):
+    folder = README.parent
+    if changed(f"reports/{name}") and not changed("README.md"):
+        # somebody has run the grid, which is no reason to fail: theirs is no reference report
+        folder = request.getfixturevalue("committed")
+    text = readme.filled(folder / "README.md", name, folder / "reports" / name)
+    assert text == (folder / "README.md").read_text("utf-8"), "make readme"
 
 
 def test_a_command_fills_in_all_results(tmp_path):
