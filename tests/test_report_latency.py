@@ -119,7 +119,7 @@ def test_readme_has_the_largest_size_and_all_tasks_only(built, tmp_path):
     text = built.text["readme.md"]
     assert text.startswith("1024x2048, panoptic, depth, batch 1; plain and the fastest engine")
     assert "| resnet18 | panoptic |" not in text
-    assert "tensorrt is unavailable: tensorrt is not installed: pip install" in text
+    assert "- Unavailable: tensorrt (tensorrt is not installed: pip install" in text
     path = tmp_path / "README.md"
     path.write_text("<!-- results:latency -->\n<!-- /results -->\n")
     assert readme.update(path, "latency", built.out)
@@ -145,6 +145,18 @@ def test_readme_has_plain_and_the_fastest_engine_of_each_precision():
         *(("plain", "fp32"), ("eager", "fp32"), ("openvino", "bf16")),
         *(("plain", "fp32"), ("openvino", "fp32"), ("openvino", "bf16")),
     ]
+
+
+def test_readme_names_what_is_wrong_in_one_sentence():
+    wrong = [
+        fake_latency.make_row(engine, precision=precision, status="wrong", why=f"by {engine}")
+        for engine, precision in (("eager", "bf16"), ("openvino", "fp16"))
+    ]
+    rows = [fake_latency.make_row("plain"), *wrong]
+    rows += [fake_latency.make_row("eager", size="64x128", status="wrong", why="elsewhere")]
+    text = latency_files.readme(tabulate(rows))
+    assert text.count("Wrong") == 1
+    assert "- Wrong: resnet18 eager bf16, resnet18 openvino fp16 (not timed, as" in text
 
 
 # --- what has no numbers --------------------------------------------------------------------------
@@ -369,4 +381,4 @@ def test_stairs_have_the_best_that_can_be_had_at_a_speed(better, heights):
 
 def test_files_have_no_more_than_the_grid_needs(built):
     assert sum(path.stat().st_size for path in built.out.iterdir()) < 1e6
-    assert latency_files.WORDS[-1] < len(latency_files.PUBLISHED)
+    assert latency_files.NAMES[-1] < len(latency_files.PUBLISHED)

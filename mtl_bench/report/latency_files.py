@@ -1,6 +1,6 @@
 """The table of a grid of latencies as CSV, Markdown, LaTeX and a page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from mtl_bench.report.latency_table import (
     IDENTITY,
     REFERENCE,
     SHORT,
+    WORDS,
     LatencyTable,
     Line,
     notes,
@@ -35,7 +36,7 @@ PUBLISHED = {
     "ms": "ms",
     "fps": "FPS",
 }
-WORDS = range(6)  # its columns of words
+NAMES = range(6)  # its columns of words
 SAME = ("argv", "threads", "device", "cpu")  # of the environment: said elsewhere, or no fact
 FACTS = ("device", "threads", "passes", "warmup", "images", "throughput_batch", "clock")
 PEAKS = {"peak_gflops": "GFLOP/s", "peak_gbs": "GB/s"}
@@ -90,7 +91,7 @@ def markdown(table: LatencyTable) -> str:
         head = ["status", "engine", "timings", "why"]
         parts.append(f"**Without numbers**\n\n{formats.pipe_table(head, lacking, range(4))}")
     for source in published(AXIS, ()):
-        shown = formats.pipe_table(list(PUBLISHED.values()), published_lines(source), WORDS)
+        shown = formats.pipe_table(list(PUBLISHED.values()), published_lines(source), NAMES)
         parts.append(f"**{source['mark']}**, not comparable with the lines above\n\n{shown}")
         parts.append(f"{source['source']}: {', '.join(formats.about(source))}.")
     parts.append("\n".join(f"- {note}" for note in notes(table)))
@@ -108,8 +109,8 @@ def readme(table: LatencyTable) -> str:
     parts = [f"**{SMOKE.capitalize()}.**"] * table.smoke
     what = f"{REFERENCE} and the fastest engine of each precision"
     parts += [f"{size}, {text(tasks)}, batch 1; {what}:", _grid(_fastest(lines), columns)]
-    lacking = [f"{engine} is {status}: {why}" for status, engine, _, why in without_numbers(table)]
-    parts.append("\n".join(f"- {words}" for words in [*dict.fromkeys(lacking), *notes(table)[:1]]))
+    lacking = [*_lacking(line for line in lines if not line.shown)]
+    parts.append("\n".join(f"- {words}" for words in [*lacking, *notes(table)[:1]]))
     return "\n\n".join(parts) + "\n"
 
 
@@ -128,7 +129,7 @@ def latex(table: LatencyTable) -> str:
     for source in published(AXIS, ()):
         lines = [list(map(formats.tex, line)) for line in published_lines(source)]
         caption = f"{source['mark']}. {source['source']}. {formats.sentence(source['note'])}."
-        parts.append(formats.floating([list(PUBLISHED.values())], lines, WORDS, caption, fit=True))
+        parts.append(formats.floating([list(PUBLISHED.values())], lines, NAMES, caption, fit=True))
     return "\n\n".join(parts) + "\n"
 
 
@@ -165,6 +166,20 @@ def html(
 
 
 # --- parts ----------------------------------------------------------------------------------------
+
+
+def _lacking(lines: Iterable[Line]) -> Iterator[str]:
+    """A sentence for each status and its reason; wrong results share one."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for line in lines:
+        backbone, _, engine, precision = line.names
+        about = "not timed, as the result differs too much from plain's"
+        why = about if line.status == "wrong" else line.why
+        which = engine if line.status == "unavailable" else f"{backbone} {engine} {precision}"
+        found.setdefault((WORDS.get(line.status, line.status), why), []).append(which)
+    for (status, why), all_named in found.items():
+        named = f"{status.capitalize()}: {', '.join(dict.fromkeys(all_named))}"
+        yield f"{named} ({why})" if why else named
 
 
 def _fastest(lines: Sequence[Line]) -> list[Line]:
