@@ -1,6 +1,7 @@
 """Engines: the same maps as the plain network's, said before a time; and a row whatever happens."""
 
 import itertools
+import math
 import re
 from pathlib import Path
 
@@ -239,6 +240,33 @@ def test_agreement_of_known_differences():
     deviations = 0.5 / maps.std()
     expected = f"maps {deviations:.2g} of their deviation (limit 0.001)"
     assert found.wrong("fp32", trained=False) == expected
+
+
+@pytest.mark.parametrize("precision", agreement.RANDOM)
+def test_one_far_value_is_no_wrong_engine_but_many_near_ones_are(precision):
+    generator = torch.Generator().manual_seed(0)
+    maps = torch.randn(1, 2, 100, 100, generator=generator)
+
+    def judged(other: Tensor) -> str:
+        found = agreement.Agreement()
+        passes = [
+            (
+                Maps(None, center_B1HW=it[:, :1], offset_B2HW=it, logits_BChw=it),
+                {"panoptic": torch.zeros(1, 100, 100)},
+            )
+            for it in (maps, other)
+        ]
+        found.update(*passes)
+        return found.wrong(precision, trained=False)
+
+    limit = agreement.RANDOM[precision]
+    far = maps.clone()
+    far[0, 0, 0, 0] += 50 * limit
+    assert judged(far) == ""
+    assert judged(maps + 0.5 * limit) == ""
+    assert "of their deviation" in judged(maps + 2 * limit)
+    far[0, 0, 0, 0] = math.nan
+    assert "of their deviation" in judged(far)
 
 
 # --- rows -----------------------------------------------------------------------------------------
