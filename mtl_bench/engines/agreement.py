@@ -21,10 +21,10 @@ LIMITS = {  # precision -> least share of equal panoptic pixels, largest median 
     "bf16": (0.95, 2e-2),  # 8 bits of mantissa: 0.4 % a rounding
 }
 # Of random weights classes and centers all but tie, so that pixels say little: the maps are judged,
-# by the root mean square of their difference over their own deviation. Of the backbones here right
-# engines are within 4e-5, 0.1 and 0.06; red and blue exchanged are 0.14 to 0.25 off. The largest of
-# millions of differences, 0.9 of right bf16, does not tell the two apart.
-RANDOM = {"fp32": 1e-3, "fp16": 0.1, "bf16": 0.1}
+# by the root mean square of their difference over their own deviation. Measured on the four shipped
+# backbones, 512x1024 and 1024x2048: fp32 up to 4e-5, fp16 0.014 (one, ResNet18's, 0.1: its inverse
+# depth is nearly constant), bf16 0.08; red and blue exchanged, logits alone, 0.14 to 0.25.
+RANDOM = {"fp32": 1e-3, "fp16": 0.05, "bf16": 0.1}
 
 
 @dataclass
