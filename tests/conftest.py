@@ -10,7 +10,7 @@ import torch
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # nothing may be downloaded in a test
 
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.core.config import Cell, load_recipe
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"  # real samples; not in a public clone
 

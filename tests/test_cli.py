@@ -11,12 +11,13 @@ import pytest
 from test_launch import fake, history, hold
 from typer.testing import CliRunner
 
-from mtl_bench import launch, plugins, provenance, results
-from mtl_bench.cli import app
-from mtl_bench.commands import grid as grid_commands
-from mtl_bench.commands import options
-from mtl_bench.config import TASKS, Cell, load_recipe
-from mtl_bench.grids import load_grid
+from mtl_bench.bench import launch, results
+from mtl_bench.bench.grid import load_grid
+from mtl_bench.cli import grid as grid_commands
+from mtl_bench.cli import options
+from mtl_bench.cli.app import app
+from mtl_bench.core import plugins, provenance
+from mtl_bench.core.config import TASKS, Cell, load_recipe
 
 GRID = """question = "Does it work?"
 recipe = "smoke"
@@ -171,7 +172,7 @@ def test_a_full_disk_is_one_line_and_a_bug_is_not(monkeypatch):
         def raise_it(*args, **settings):
             raise error
 
-        monkeypatch.setattr("mtl_bench.results.inspect", raise_it)
+        monkeypatch.setattr("mtl_bench.bench.results.inspect", raise_it)
 
     fail(OSError(28, "No space left on device", "runs/x"))
     assert "No space left on device: runs/x" in one_line("status", "--grid", "backbones")
@@ -344,7 +345,7 @@ CELL = ("--recipe", "smoke", "--backbone", "tiny", "--method", "fixed", "--tasks
 @pytest.fixture
 def train(tmp_path, monkeypatch):
     """`train` with a stand-in for the training, which `behave` may replace."""
-    module = types.ModuleType("mtl_bench.run")
+    module = types.ModuleType("mtl_bench.bench.run")
     seen = []
 
     def run_cell(cell, directory, root, device, wandb, echo):
@@ -359,7 +360,7 @@ def train(tmp_path, monkeypatch):
 
     run.behave, run.seen = (lambda directory: None), seen
     module.run_cell = run_cell
-    monkeypatch.setitem(sys.modules, "mtl_bench.run", module)
+    monkeypatch.setitem(sys.modules, "mtl_bench.bench.run", module)
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
     return run
 
