@@ -22,7 +22,7 @@ import torch
 
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.data import frame_cache, loader, synthetic
-from mtl_bench.data.batch import Batch
+from mtl_bench.core.batch import Batch
 from mtl_bench.data.cityscapes import Cityscapes
 
 NOISE = 0.62  # of 255, standard deviation

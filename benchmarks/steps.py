@@ -18,7 +18,7 @@ from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.device import Engine
 from mtl_bench.core.terms import Term, gather
 from mtl_bench.data import synthetic
-from mtl_bench.data.batch import Batch
+from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import open_dataset, train_batches
 from mtl_bench.model import Model

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from mtl_bench import __version__
 from mtl_bench.core import config
-from mtl_bench.data.labels import LabelSet
+from mtl_bench.core.labels import LabelSet
 from mtl_bench.engines import onnx_file
 from mtl_bench.engines.graph import Strided, strided
 from mtl_bench.tasks.finish import Finish

@@ -25,7 +25,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from mtl_bench.core import config, geometry
 from mtl_bench.core.device import Engine
 from mtl_bench.core.provenance import cpu_model
-from mtl_bench.data.batch import Batch
+from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.evaluate.walk import evaluating
 from mtl_bench.tasks.finish import Finish

@@ -8,7 +8,7 @@ from kornia.enhance import (
 
 from mtl_bench.core import config
 from mtl_bench.data import augment as A
-from mtl_bench.tasks.panoptic.targets import OUTSIDE
+from mtl_bench.core.labels import OUTSIDE
 
 PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
 MEAN = torch.tensor([123.675, 116.28, 103.53]) / 255

@@ -21,7 +21,8 @@ from cityscapes_tree import (
 from mtl_bench.core import config
 from mtl_bench.data.check import check
 from mtl_bench.data.cityscapes_files import neighbour, read_instance_ids, unlabelled_names
-from mtl_bench.data.labels import CITYSCAPES20, IGNORE
+from mtl_bench.core.labels import IGNORE
+from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 NAME = "aachen_000000_000019"

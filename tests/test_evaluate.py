@@ -14,7 +14,8 @@ from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 
 from mtl_bench.core.config import Cell, Data, Evaluate, Loss, Recipe
-from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, IGNORE
+from mtl_bench.core.labels import IGNORE
+from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.evaluate.export_predictions import export_predictions, write_panoptic
 from mtl_bench.evaluate.trivial import Average, baselines

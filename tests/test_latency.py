@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mtl_bench import latency
 from mtl_bench.core import config
-from mtl_bench.data.batch import Batch
+from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.model import Outputs
 from mtl_bench.tasks import finish

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mtl_bench.core import config, geometry
-from mtl_bench.data.batch import Batch
+from mtl_bench.core.batch import Batch
 from mtl_bench.model import Outputs
 from mtl_bench.tasks.depth.photometric import photometric_loss
 from mtl_bench.tasks.depth.smoothness import smoothness_loss

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from mtl_bench.core import config
-from mtl_bench.data.labels import CITYSCAPES20, IGNORE
+from mtl_bench.core.labels import IGNORE
+from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.model import Outputs
 from mtl_bench.tasks.depth import scale as depth_scale
 from mtl_bench.tasks.panoptic import postprocess

@@ -21,7 +21,8 @@ from mtl_bench.bench import results
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Cell, load_recipe, to_dict
 from mtl_bench.core.geometry import scale_intrinsics
-from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, IGNORE
+from mtl_bench.core.labels import IGNORE
+from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.model import Outputs, build_model
 from mtl_bench.show import predict
 from mtl_bench.show.predict import HEIGHTS, METRES, UNSCALED, Predictor, video

@@ -11,7 +11,7 @@ from torch import nn
 from mtl_bench.core import config
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.data import synthetic
-from mtl_bench.data.batch import Batch
+from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES19
 from mtl_bench.data.layouts import KITTI
 from mtl_bench.data.loader import open_dataset

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from mtl_bench.core import config
-from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, IGNORE
-from mtl_bench.tasks.panoptic.targets import OUTSIDE, class_of_instance_id, panoptic_targets
+from mtl_bench.core.labels import IGNORE
+from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
+from mtl_bench.core.labels import OUTSIDE, class_of_instance_id
+from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 LOSS = config.Loss()
 

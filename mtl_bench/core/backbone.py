@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import timm
-import torch
 from torch import Tensor, nn
 
 
@@ -67,17 +66,3 @@ class TimmBackbone(Backbone):
         features = self.pyramid(image_B3HW)
         found = dict(zip(self._stride_of_level, features, strict=True))
         return {stride: found[stride] for stride in self.channels}
-
-
-class Normalize(nn.Module):
-    """RGB in [0, 1] -> zero mean, unit variance per channel of the pre-training images."""
-
-    def __init__(self, mean: tuple[float, ...], std: tuple[float, ...]):
-        super().__init__()
-        self.register_buffer("mean_311", torch.tensor(mean).view(3, 1, 1), persistent=False)
-        self.register_buffer("std_311", torch.tensor(std).view(3, 1, 1), persistent=False)
-        self.mean_311: Tensor
-        self.std_311: Tensor
-
-    def forward(self, image_B3HW: Tensor) -> Tensor:
-        return (image_B3HW - self.mean_311) / self.std_311

@@ -34,7 +34,6 @@ __all__ += ["did_you_mean", "from_dict", "set_values", "to_dict"]
 
 PROTOCOL = 2  # raised when numbers made before stop being comparable with numbers made after
 RECIPES = Path(__file__).parents[1] / "bench" / "recipes"
-TASKS = ("panoptic", "depth")
 GRANULARITIES = ("terms", "tasks")
 # Values that recipes have had since protocol 2 began. One that is its default is left out of the
 # canonical JSON, so that cells which were run before keep their ids.
@@ -62,7 +61,7 @@ class Cell:
     recipe: Recipe
     backbone: str
     method: str  # a name, or a loss-value method and a gradient method: a+b
-    tasks: tuple[str, ...] = TASKS
+    tasks: tuple[str, ...] = ()  # none named: the recipe's
     seed: int = 0
     video: bool = False  # the second training, on pseudo-labeled frames too
     single_task: bool = False  # one network a task, each trained alone
@@ -72,6 +71,8 @@ class Cell:
     backbone_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
+        if not self.tasks:
+            object.__setattr__(self, "tasks", self.recipe.tasks)
         if self.granularity not in GRANULARITIES:
             known = did_you_mean(self.granularity, GRANULARITIES)
             raise ValueError(f"no granularity '{self.granularity}'{known}")
@@ -81,8 +82,6 @@ class Cell:
             )
         if self.single_task and len(self.tasks) < 2:
             raise ValueError(f"single_task needs two tasks or more, not {list(self.tasks)}")
-        if self.video and "panoptic" not in self.tasks:
-            raise ValueError("video needs the task panoptic: its labels are what the stage makes")
 
     @property
     def parents(self) -> tuple["Cell", ...]:
@@ -108,7 +107,7 @@ class Cell:
 def canonical_json(cell: Cell) -> str:
     """What makes a cell itself: without names, prose and how often a checkpoint is written."""
     values = to_dict(cell)
-    for key in ("name", "about"):
+    for key in ("name", "about", "tasks"):
         del values["recipe"][key]
     for key in ("checkpoint_every", "cosine_every"):
         del values["recipe"]["optim"][key]

@@ -1,18 +1,22 @@
-"""Finds, describes and loads the files in methods/ and backbones/; their stems are the names.
+"""Finds, describes and loads plug-ins: one file each, whose stem is its name.
 
-Searched in this order: the package's own folders (the checkout's, or those inside an installed
-wheel), `./methods` and `./backbones` of the working directory, and what `--plugins` names: a
-folder with those two in it, a folder of plug-ins of either kind, or one file. A file reached twice
-counts once. `_name.py` is a helper that its neighbours import with `from ._name import ...`.
+Kinds: methods, backbones, tasks, datasets, engines. Searched in this order: the package's own
+folders (the checkout's, or those inside an installed wheel), those of the working directory, and
+what `--plugins` names: a folder with such folders in it, a folder of plug-ins of any kind, or one
+file. A file reached twice counts once; a package's file is its `__init__.py`. `_name.py` is a helper
+that its neighbours import with `from ._name import ...`.
 
 Finding and describing read the files as text; only `load` runs one.
 """
 
 import ast
+import contextlib
+import functools
 import hashlib
 import importlib
 import importlib.util
 import inspect
+import itertools
 import os
 import re
 import sys
@@ -23,15 +27,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.core.config import TASKS, Cell, did_you_mean
+from mtl_bench.core.config import Cell, did_you_mean
 
-KINDS = ("methods", "backbones")
 PACKAGE = Path(__file__).resolve().parents[1]
 VARIABLE = "MTL_BENCH_PLUGINS"  # what --plugins adds to; the processes that run cells inherit it
-
-BASES = {
+BASES = {  # kind -> its contract, and the base of every plug-in
     "methods": ("mtl_bench.core.method", "Method"),
     "backbones": ("mtl_bench.core.backbone", "Backbone"),
+    "tasks": ("mtl_bench.core.task", "Task"),
+    "datasets": ("mtl_bench.core.dataset", "Dataset"),
+    "engines": ("mtl_bench.core.engine", "Engine"),
+}
+KINDS = tuple(BASES)
+SHIPPED = {  # in the package; the others have a folder of their own beside it
+    "tasks": PACKAGE / "tasks",
+    "datasets": PACKAGE / "data",
+    "engines": PACKAGE / "deploy" / "engines",
 }
 GIVEN = ("self", "terms", "seed", "strides", "pretrained")  # the harness fills these arguments in
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -70,8 +81,9 @@ def folders(kind: str) -> list[Path]:
     shipped = PACKAGE / "_shipped"
     own = shipped if shipped.is_dir() else PACKAGE.parent
     extra = [Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep) if p]
-    found = [root / kind for root in (own, Path.cwd(), *extra)] + [p for p in extra if p.is_dir()]
-    return list(dict.fromkeys(p.resolve() for p in found if p.is_dir()))
+    found = [SHIPPED.get(kind, own / kind), *(root / kind for root in (Path.cwd(), *extra))]
+    found += [place for place in extra if place.is_dir()]
+    return list(dict.fromkeys(place.resolve() for place in found if place.is_dir()))
 
 
 def files(kind: str) -> dict[str, Path]:
@@ -103,28 +115,66 @@ def kinds_of(name: str) -> list[str]:
 
 def _candidates(kind: str) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
-    paths = [path for folder in folders(kind) for path in sorted(folder.glob("[!_.]*.py"))]
+    paths = [path for folder in folders(kind) for path in _files_in(folder)]
     extra = (Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep))
     paths += [path for path in extra if path.is_file()]
     for path in dict.fromkeys(path.resolve() for path in paths):
         if _kind_of(path) == kind:
-            found.setdefault(path.stem, []).append(path)
+            found.setdefault(name_of(path), []).append(path)
     return dict(sorted(found.items()))
 
 
+def _files_in(folder: Path) -> list[Path]:
+    return sorted([*folder.glob("[!_.]*.py"), *folder.glob("[!_.]*/__init__.py")])
+
+
+def name_of(path: Path) -> str:
+    """The stem; of a package its folder's name."""
+    return path.parent.name if path.stem == "__init__" else path.stem
+
+
 def _kind_of(path: Path) -> str | None:
-    """By the folder's name; in a folder of another name, by what the file imports."""
-    if path.parent.name in KINDS:
-        return path.parent.name
+    """By the folder's name; in a folder of another name, by what the file imports or defines."""
+    folder = path.parent.parent if path.stem == "__init__" else path.parent
+    for kind, place in SHIPPED.items():
+        if folder == place:  # other modules lie beside the plug-ins
+            return kind if path in _derived(folder, BASES[kind][1]) else None
+    if folder.name in KINDS:
+        return folder.name
     text = path.read_text(encoding="utf-8", errors="replace")
     for kind, (module, base) in BASES.items():
-        last = module.rpartition(".")[2]
+        package, _, last = module.rpartition(".")
         imports = (
-            rf"^\s*(from\s+{module}\b|import\s+{module}\b|from\s+mtl_bench\s+import\s+{last}\b)"
+            rf"^\s*(from\s+{module}\b|import\s+{module}\b|from\s+{package}\s+import\s+{last}\b)"
         )
         if re.search(imports, text, re.MULTILINE) and base in text:
             return kind
     return None
+
+
+@functools.cache
+def _derived(folder: Path, base: str) -> set[Path]:
+    """Files of a shipped folder that define a class whose bases lead, through the folder, to one
+    of this name or whose name ends with it."""
+    classes = [
+        (node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases}, path)
+        for path in _files_in(folder)
+        for node in _parse(path.read_bytes()).body
+        if isinstance(node, ast.ClassDef)
+    ]
+    names, found, size = {base, f"Graph{base}"}, set[Path](), -1
+    while len(found) > size:  # a class may come before its base
+        size = len(found)
+        for name, bases, path in classes:
+            if bases & names:
+                names.add(name)
+                found.add(path)
+    return found
+
+
+@functools.cache
+def _parse(text: bytes) -> ast.Module:
+    return ast.parse(text)
 
 
 # --- describing -----------------------------------------------------------------------------------
@@ -172,6 +222,36 @@ def _installed(package: str) -> bool:
     return package in sys.modules or importlib.util.find_spec(package) is not None
 
 
+def attributes(kind: str, name: str) -> dict[str, Any]:
+    """Class attributes of a plug-in's file that have a literal value, without importing it.
+
+    Raises:
+        ValueError: an unknown or ambiguous name.
+    """
+    return dict(_attributes(path_of(kind, name).read_bytes()))
+
+
+@functools.cache
+def _attributes(text: bytes) -> Mapping[str, Any]:
+    found: dict[str, Any] = {}
+    classes = (node for node in _parse(text).body if isinstance(node, ast.ClassDef))
+    for item in itertools.chain.from_iterable(node.body for node in classes):
+        targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
+        if isinstance(item, (ast.Assign, ast.AnnAssign)) and item.value is not None:
+            with contextlib.suppress(ValueError):  # not a literal
+                found |= {ast.unparse(t): ast.literal_eval(item.value) for t in targets if t}
+    return found
+
+
+def lack(packages: Iterable[str], extra: Iterable[str]) -> str | None:
+    """Which of the packages are not installed here, and how to install them; None: all are."""
+    lacking = [package for package in packages if importlib.util.find_spec(package) is None]
+    if not lacking:
+        return None
+    words = " ".join(f"'{word}'" for word in extra)
+    return f"lacks the package {', '.join(lacking)}" + (f": pip install {words}" if words else "")
+
+
 # --- loading --------------------------------------------------------------------------------------
 
 
@@ -180,11 +260,15 @@ def load(kind: str, name: str) -> type[Any]:
 
     Raises:
         ValueError: unknown or ambiguous name, a file that fails to import (with its line), or one
-            that does not define exactly one subclass of `Method` (`Backbone`).
+            that does not define exactly one subclass of `Method` (`Backbone`, `Engine`).
     """
     path = path_of(kind, name)
     base_module, base_name = BASES[kind]
     base = getattr(importlib.import_module(base_module), base_name)
+    if path.is_relative_to(PACKAGE) and kind in SHIPPED:
+        module_name = ".".join(("mtl_bench", *path.relative_to(PACKAGE).with_suffix("").parts))
+        module = importlib.import_module(module_name.removesuffix(".__init__"))
+        return _only_subclass(module, base, name, path)
     package = f"mtl_bench_plugins_{hashlib.sha256(str(path.parent).encode()).hexdigest()[:8]}"
     if package not in sys.modules:  # a package per folder: relative imports work, nothing leaks out
         sys.modules[package] = types.ModuleType(package)
@@ -207,11 +291,19 @@ def load(kind: str, name: str) -> type[Any]:
         )
         raise ValueError(f"{path}{line}: {type(error).__name__}: {error}") from error
     vars(module)["_fingerprint"] = version
-    own = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module_name]
-    found = list(dict.fromkeys(c for c in own if issubclass(c, base)))
+    return _only_subclass(module, base, name, path)
+
+
+def _only_subclass(module: types.ModuleType, base: type[Any], name: str, path: Path) -> type[Any]:
+    """The one subclass that a module defines, told its name."""
+    own = [c for c in vars(module).values() if inspect.isclass(c)]
+    own = [c for c in own if c.__module__ == module.__name__ and issubclass(c, base)]
+    found = list(dict.fromkeys(own))
     if len(found) != 1:
         names = ", ".join(c.__name__ for c in found) or "none"
-        raise ValueError(f"{path} must define one subclass of {base_name}, and defines {names}")
+        raise ValueError(f"{path} must define one subclass of {base.__name__}, and defines {names}")
+    if hasattr(base, "name"):
+        found[0].name = name
     return found[0]
 
 
@@ -255,11 +347,11 @@ def check_cells(cells: Iterable[Cell]) -> None:
     """
     seen: set[tuple[str, str, tuple[str, ...]]] = set()
     for cell in cells:
-        for task in cell.tasks:
-            if task not in TASKS:
-                raise ValueError(f"no task called '{task}'{did_you_mean(task, TASKS)}")
-        if not cell.tasks:
-            raise ValueError(f"a cell needs a task: {', '.join(TASKS)}")
+        if len(set(cell.tasks)) < len(cell.tasks):
+            raise ValueError(f"a task is named twice: {', '.join(cell.tasks)}")
+        declared = [attributes("tasks", task) for task in cell.tasks]
+        if cell.video and not any(found.get("makes_labels") for found in declared):
+            raise ValueError(f"video needs a task that makes labels, not {', '.join(cell.tasks)}")
         for kind, name, values in _chosen(cell):
             if (kind, name, tuple(values)) in seen:
                 continue
@@ -282,4 +374,10 @@ def _chosen(cell: Cell) -> list[tuple[str, str, Mapping[str, Any]]]:
                 f"method '{cell.method}' has no part '{name}': --set method.{names[0]}.KEY=VALUE"
             )
     methods = [("methods", name, parts.get(name, {})) for name in names]
-    return [*methods, ("backbones", cell.backbone, cell.backbone_args)]
+    dataset = cell.recipe.data.dataset.replace("-", "_")
+    return [
+        *methods,
+        ("backbones", cell.backbone, cell.backbone_args),
+        *(("tasks", task, {}) for task in cell.tasks),
+        ("datasets", dataset, {}),
+    ]

@@ -127,6 +127,7 @@ class Recipe:
     name: str = "paper"
     about: str = ""
     smoke: bool = False  # marks rows that must never be read as results
+    tasks: tuple[str, ...] = ("panoptic", "depth")  # of a cell that names none
     data: Data = field(default_factory=Data)
     augment: Augment = field(default_factory=Augment)
     network: Network = field(default_factory=Network)

@@ -1,8 +1,8 @@
 """Random changes of one training sample: resize, crop, pad, flip and colour jitter.
 
-N frames of one place (the annotated one and its neighbours) share the geometry and the jitter, and
-the intrinsics follow the geometry. Pixel centres are integers: the top-left pixel is (0, 0).
-Order and ranges are MGNet's; every side is padded with the same colour, and a flip mirrors the
+N frames of one place (the annotated one and its neighbours) share the geometry and the jitter; the
+intrinsics and every other field follow the geometry, each by its kind. Pixel centres are integers:
+the top-left pixel is (0, 0). Order and ranges are MGNet's; every side is padded with the same colour, and a flip mirrors the
 principal point to W - 1 - cx, as integer centres demand.
 
 Frames of 1024 x 2048 set the pace: only what a crop shows is resized, and a worker changes colours
@@ -10,7 +10,7 @@ block by block, so that what a block needs stays in the processor's cache.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 
@@ -21,9 +21,12 @@ from kornia.enhance import adjust_brightness_accumulative, adjust_saturation_wit
 from torch import Generator, Tensor
 
 from mtl_bench.core import config
-from mtl_bench.tasks.panoptic.targets import OUTSIDE
+from mtl_bench.core.dataset import Kind
+from mtl_bench.core.labels import OUTSIDE
 
 PADDING_RGB = (123.675 / 255, 116.28 / 255, 103.53 / 255)  # ImageNet's mean colour
+
+OUTSIDE_OF = {Kind.IDS: OUTSIDE}  # what padding holds; 0 in other kinds
 
 Change = Callable[[Tensor], Tensor]  # of a block's colours
 _BLOCK = 2**16  # pixels of a block; with three channels 768 KiB
@@ -36,50 +39,85 @@ _YIQ = torch.tensor([[0.299, 0.587, 0.114], [0.5959, -0.2746, -0.3213], [0.2115,
 class Augmented:
     clean_N3HW: Tensor  # float RGB in [0, 1]
     jittered_N3HW: Tensor
-    K_33: Tensor
-    instance_ids_HW: Tensor  # OUTSIDE on padding
+    K_33: Tensor | None
+    static_HW: Tensor  # ids, OUTSIDE on padding
+    fields: dict[str, Tensor]
 
 
 def augment(
     frames_N3HW: Tensor | Sequence[Tensor],
-    K_33: Tensor,
-    instance_ids_HW: Tensor,
+    K_33: Tensor | None,
+    static_HW: Tensor,
+    fields: Mapping[str, Tensor],
+    kinds: Mapping[str, Kind],
     settings: config.Augment,
     generator: Generator,
 ) -> Augmented:
     """One random draw; the result has the crop's size, or the input's where there is no crop.
 
     Args:
-        frames_N3HW: uint8 RGB, the annotated frame first; in any memory layout.
-        K_33: intrinsics in pixels of the frames.
-        instance_ids_HW: Cityscapes' instance ids.
+        frames_N3HW: uint8 RGB, the frame itself first; in any memory layout.
+        K_33: intrinsics in pixels of the frames; None where there are none.
+        static_HW: ids that tell which pixels move with the scene.
+        fields: maps of the frame's size and vectors, by name.
+        kinds: what each of them is.
         settings: what may change and how much.
         generator: the only source of randomness.
     """
     scale_draw, top, left, pad_top, pad_left, flip_draw = torch.rand(
         6, generator=generator
     ).tolist()
-    height, width = settings.crop or instance_ids_HW.shape
+    own = (static_HW.shape[0], static_HW.shape[1])
+    height, width = settings.crop or own
     factor = settings.scales[int(scale_draw * len(settings.scales))]
-    size = _times(instance_ids_HW.shape, factor)
+    size = _times(own, factor)
     spare_y, spare_x = size[0] - height, size[1] - width
     y, x = _offset(top, spare_y), _offset(left, spare_x)
     window = (slice(y, min(y + height, size[0])), slice(x, min(x + width, size[1])))
-    frames, K, ids = resize(frames_N3HW, K_33, instance_ids_HW, factor, window)
-    if settings.flip and flip_draw < 0.5:
-        frames, K, ids = flip(frames, K, ids)
+    frames, K = resize(frames_N3HW, K_33, own, factor, window)
+    mirrored = settings.flip and flip_draw < 0.5
+    if mirrored:
+        frames, K = flip(frames, K)
 
     clean = frames / 255
     jittered = jitter(clean, settings, generator)
+    place = None
     if spare_y < 0 or spare_x < 0:  # after the jitter, so that padding has one colour
         y, x = _offset(pad_top, -spare_y), _offset(pad_left, -spare_x)
-        window = (slice(y, y + ids.shape[0]), slice(x, x + ids.shape[1]))
-        clean = _pad(clean, height, width, window)
-        jittered = _pad(jittered, height, width, window)
-        ids, inner = ids.new_full((height, width), OUTSIDE), ids
-        ids[window] = inner
+        place = (slice(y, y + frames.shape[2]), slice(x, x + frames.shape[3]))
+        clean = _pad(clean, height, width, place)
+        jittered = _pad(jittered, height, width, place)
         K = shift(K, x, y)
-    return Augmented(clean, jittered, K, ids)
+
+    def turned(value: Tensor, kind: Kind) -> Tensor:
+        if kind is Kind.VECTOR:
+            return value
+        value = _nearest_of(value, size, window)
+        value = value.flip(-1) if mirrored else value
+        if place is not None:
+            padded = value.new_full((*value.shape[:-2], height, width), OUTSIDE_OF.get(kind, 0))
+            padded[(..., *place)] = value
+            value = padded
+        return _values(value, kind, factor, mirrored)
+
+    static = turned(static_HW, Kind.IDS)
+    own_ids = {name: value is static_HW for name, value in fields.items()}
+    made = {
+        name: static if own_ids[name] else turned(value, kinds[name])
+        for name, value in fields.items()
+    }
+    return Augmented(clean, jittered, K, static, made)
+
+
+def _values(value: Tensor, kind: Kind, factor: float, mirrored: bool) -> Tensor:
+    """What a zoom and a flip do to the numbers themselves."""
+    if kind is Kind.DEPTH and factor != 1:
+        return value / factor
+    if kind is Kind.INVERSE_DEPTH and factor != 1:
+        return value * factor
+    if kind is Kind.NORMALS and mirrored:
+        return value * value.new_tensor([-1, 1, 1])[:, None, None]
+    return value
 
 
 def _offset(draw: float, spare: int) -> int:
@@ -95,29 +133,38 @@ def _pad(frames: Tensor, height: int, width: int, window: tuple[slice, slice]) -
 
 def resize(
     frames_N3HW: Tensor | Sequence[Tensor],
-    K_33: Tensor,
-    ids_HW: Tensor,
+    K_33: Tensor | None,
+    own: tuple[int, int],
     factor: float,
     window: tuple[slice, slice] | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Bilinear (averaging where it shrinks), labels by the nearest pixel.
+) -> tuple[Tensor, Tensor | None]:
+    """Bilinear, averaging where it shrinks.
 
     Args:
+        own: height and width of the frames.
         window: rows and columns of the resized frames to keep; None: all. What is kept is the same
             to the last bit.
     """
-    height, width = ids_HW.shape
-    size = _times(ids_HW.shape, factor)
+    size = _times(own, factor)
     rows, columns = window or (slice(0, size[0]), slice(0, size[1]))
-    if size == (height, width):
-        frames, K, ids = [frame[:, rows, columns] for frame in frames_N3HW], K_33, ids_HW
-        ids = ids_HW[rows, columns]
+    K = K_33
+    if size == own:
+        frames = [frame[:, rows, columns] for frame in frames_N3HW]
     else:
         frames = [_resized(frame, size, rows, columns) for frame in frames_N3HW]
-        K = scale(K_33, size[1] / width, size[0] / height)
-        ids = ids_HW[_nearest(height, size[0])[rows]][:, _nearest(width, size[1])[columns]]
+        K = None if K_33 is None else scale(K_33, size[1] / own[1], size[0] / own[0])
     # Channel by channel in memory: the jitter takes the frames for one tall picture.
-    return torch.stack(frames, 1).transpose(0, 1), shift(K, -columns.start, -rows.start), ids
+    return torch.stack(frames, 1).transpose(0, 1), shift(K, -columns.start, -rows.start)
+
+
+def _nearest_of(value: Tensor, size: tuple[int, int], window: tuple[slice, slice]) -> Tensor:
+    """A window of a map at another size, every pixel the nearest of its own."""
+    height, width = value.shape[-2:]
+    rows, columns = window
+    if size == (height, width):
+        return value[..., rows, columns]
+    down, right = _nearest(height, size[0])[rows], _nearest(width, size[1])[columns]
+    return value[..., down, :][..., right]
 
 
 def _times(size: Sequence[int], factor: float) -> tuple[int, int]:
@@ -152,11 +199,13 @@ def _nearest(old: int, new: int) -> Tensor:
     return F.interpolate(pixels, new, mode="nearest-exact")[0, 0].long()
 
 
-def flip(frames_N3HW: Tensor, K_33: Tensor, ids_HW: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def flip(frames_N3HW: Tensor, K_33: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Mirror left and right; time still runs forward, so no neighbour changes place."""
-    K = K_33.clone()
-    K[0, 2] = frames_N3HW.shape[-1] - 1 - K[0, 2]
-    return frames_N3HW.flip(-1), K, ids_HW.flip(-1)
+    K = K_33
+    if K is not None:
+        K = K.clone()
+        K[0, 2] = frames_N3HW.shape[-1] - 1 - K[0, 2]
+    return frames_N3HW.flip(-1), K
 
 
 def scale(K_33: Tensor, x: float, y: float) -> Tensor:
@@ -169,8 +218,10 @@ def scale(K_33: Tensor, x: float, y: float) -> Tensor:
     return K
 
 
-def shift(K_33: Tensor, x: int, y: int) -> Tensor:
+def shift(K_33: Tensor | None, x: int, y: int) -> Tensor | None:
     """Intrinsics after every pixel moved right by x and down by y."""
+    if K_33 is None:
+        return None
     K = K_33.clone()
     K[0, 2] += x
     K[1, 2] += y

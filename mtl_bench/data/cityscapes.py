@@ -1,231 +1,172 @@
-"""Cityscapes as samples: the real one and anything in its layout.
+"""Cityscapes: the real one and anything in its layout.
 
-A training sample is an augmented frame, its neighbours in time where a task needs them, and the
-panoptic targets; an evaluation sample is the plain frame with ground truth at the frame's own size.
 Frames larger than the recipe's input are shrunk to it, intrinsics and labels with them: on every
 reading, or once where `mtl-bench data cache` wrote them down.
 """
 
-import copy
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Generator, Tensor
 
-from mtl_bench.core import config
+from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames
+from mtl_bench.core.recipe import Data, Recipe
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data import frame_cache
-from mtl_bench.data.augment import augment as draw_augmented
 from mtl_bench.data.augment import scale
-from mtl_bench.data.batch import Batch
-from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE, Kind
+from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE
+from mtl_bench.data.cityscapes_files import Kind as Package
 from mtl_bench.data.frame_cache import FrameCache, Source
-from mtl_bench.data.labels import CITYSCAPES20, LabelSet
-from mtl_bench.tasks.panoptic.targets import OUTSIDE, panoptic_targets
-
-NOT_REPROJECTED = torch.tensor([files.EGO_ID, files.SKY_ID, OUTSIDE])
-PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
+from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.data.pseudo_frames import CityscapesFrames
 
 
-@dataclass(frozen=True)
-class DecodedFrame:
-    """What is kept of a decoded frame; everything random comes later."""
-
-    images_N3HW: Sequence[Tensor]  # uint8, input size; in training followed by previous and next
-    K_33: Tensor
-    camera_height_m: float
-    camera_pitch_rad: float
-    instance_ids: Tensor | None  # int32; input size in training, own size in evaluation
-    depth_m: Tensor | None
-
-
-class Cityscapes:
+class Cityscapes(Dataset):
     """One split.
 
-    Frames without labels, which the depth task trains on, too, may share `<root>/ego_mask.png`: of
-    the frames' own size, 8 bits, not 0 on the ego vehicle and whatever else has nothing to tell.
+    Frames without labels, which a task that needs neighbours trains on, too, may share
+    `<root>/ego_mask.png`: of the frames' own size, 8 bits, not 0 on the ego vehicle and whatever
+    else has nothing to tell.
 
     Args:
         root: the folder that holds leftImg8bit, gtFine, camera, ...
-        split: train, val or test.
-        data: input size and whether decoded frames stay in memory.
-        labels: the classes.
-        video: the depth task: neighbours in training, disparity maps in evaluation.
-        panoptic: the panoptic task: label files are a must. Without it they only mask the
-            reprojection, where they exist.
-        augment: random changes of training samples; None for a split that is only evaluated, of
-            which no neighbour is needed.
-        loss: what the targets depend on.
-        sequence_labels: a folder `<city>/*_gtFine_instanceIds.png` with labels of further frames
+        needs: with "instance_ids", label files are a must. Without it they only mask what does not
+            move, where they exist.
+        further_labels: a folder `<city>/*_gtFine_instanceIds.png` with labels of further frames
             of `leftImg8bit_sequence`, which then are training frames too (human labels win).
-
-    Raises:
-        ValueError: no frames, or frames that lack a file, the first one named.
     """
+
+    labels = CITYSCAPES20
+    fields: ClassVar[Mapping[str, Kind]] = {"instance_ids": Kind.IDS, "depth_m": Kind.DEPTH}
+    truths: ClassVar[tuple[str, ...]] = ("disparity",)
+    static_ids: ClassVar[tuple[int, ...]] = (files.EGO_ID, files.SKY_ID)
+    takes_further_labels = True
+    layout = "Cityscapes"
+    published: ClassVar[Mapping[str, int]] = {"train": 2975, "val": 500, "test": 1525}
 
     def __init__(
         self,
         root: Path,
         split: str,
-        data: config.Data,
-        labels: LabelSet = CITYSCAPES20,
+        data: Data,
         *,
-        video: bool,
-        panoptic: bool,
-        augment: config.Augment | None,
-        loss: config.Loss,
-        sequence_labels: Path | None = None,
+        needs: Collection[str] = (),
+        training: bool = False,
+        truth: str = "default",
+        further_labels: Path | None = None,
     ) -> None:
-        self.root, self.split, self.data, self.labels = root, split, data, labels
-        self.video, self.panoptic, self.loss = video, panoptic, loss
-        self.sequence_labels = sequence_labels
-        self._augment = augment or PLAIN
-        self._cache: dict[tuple[int, bool], DecodedFrame] | None = {} if data.cache else None
+        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
+        self.further_labels = further_labels
         self.on_disk = FrameCache(root, data, self._to_input)
         self.names = files.annotated_names(root, split)
         self._annotated = frozenset(self.names)
         self._label_files = self._find_labels()
-        if sequence_labels:
+        if further_labels:
             self.names = self._with_sequence_frames()
         mask_path = root / files.EGO_MASK.suffix
-        masked = video and augment is not None and not self._annotated <= self._label_files.keys()
+        masked = self._compares and not self._annotated <= self._label_files.keys()
         self._ego_mask = files.read_ego_mask(mask_path) if masked and mask_path.exists() else None
         self._camera_names = self._find_cameras()
-        self._require_files(training=augment is not None)
+        self._require_files()
 
-    def __len__(self) -> int:
-        return len(self.names)
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        return (root / IMAGE.folder).exists()
+
+    @classmethod
+    def check(cls, root: Path, deep: bool = False) -> tuple[list[str], int]:
+        from mtl_bench.data.check import check
+
+        report = check(root, deep=deep)
+        return report.summary(), len(report.problems)
+
+    @classmethod
+    def image_files(cls, root: Path, split: str) -> dict[str, Path]:
+        folder = root / IMAGE.folder / split
+        return {name: files.file_of(folder, IMAGE, name) for name in files.annotated_names(root, split)}
+
+    @classmethod
+    def frames_to_label(
+        cls, root: Path, out: Path | None, split: str, recipe: Recipe
+    ) -> LabelFrames:
+        """Those of the sequences that have both neighbours and no human label."""
+        return CityscapesFrames(root, out, split, recipe)
 
     @property
-    def reprojection_mask(self) -> str:
-        """What the training frames' masks come from: labels, ego_mask.png, none, or two of them."""
+    def _compares(self) -> bool:
+        """Whether training frames are compared with their neighbours in time."""
+        return self.training and NEIGHBOURS in self.needs
+
+    @property
+    def static_from(self) -> str:
+        """Labels, ego_mask.png, none, or two of them."""
         labelled = len(self._label_files.keys() & set(self.names))
         return files.reprojection_mask(len(self.names), labelled, self._ego_mask is not None)
 
     @property
-    def needs_automask(self) -> bool:
-        """Whether masks may leave the sky in: only labels know where it is."""
-        return self.reprojection_mask != "labels"
+    def knows_static(self) -> bool:
+        """Only labels know where the sky is."""
+        return self.static_from == "labels"
 
-    def sources(self, training: bool) -> list[Source]:
+    def sources(self) -> list[Source]:
         """The files that samples are made of and that `on_disk` can hold."""
         images = [self._image_file(name) for name in self.names]
-        if training and self.video:
+        if self._compares:
             around = {files.neighbour(name, step) for name in self.names for step in (-1, 1)}
             images += sorted({self._file(SEQUENCE, name) for name in around}.difference(images))
         labels = [self._label_files[name] for name in self.names if name in self._label_files]
         sources = [(path, frame_cache.IMAGE) for path in images]
-        return sources + [(path, frame_cache.LABELS) for path in labels if training]
-
-    def uncached(self) -> "Cityscapes":
-        """The same split, remembering nothing: for worker processes, which would each hold it."""
-        other = copy.copy(self)
-        other._cache = None
-        other.on_disk = FrameCache(self.root, self.data, other._to_input)
-        return other
-
-    def sample(self, index: int, generator: Generator | None) -> Batch:
-        """One sample, tensors without the B axis.
-
-        Args:
-            index: position in `names`.
-            generator: source of the augmentation; None for an evaluation sample.
-
-        Raises:
-            ValueError: a file of the frame is missing, damaged or does not fit the others.
-        """
-        training = generator is not None
-        frame = self._cache.get((index, training)) if self._cache is not None else None
-        if frame is None:
-            frame = self._read(self.names[index], training)
-            if self._cache is not None:
-                self._cache[index, training] = frame
-        if generator is None:
-            return self._evaluation_sample(self.names[index], frame)
-        return self._training_sample(self.names[index], frame, generator)
-
-    # --- samples ----------------------------------------------------------------------------------
-
-    def _evaluation_sample(self, name: str, frame: DecodedFrame) -> Batch:
-        return Batch(
-            names=[name],
-            image_B3HW=frame.images_N3HW[0].contiguous().float() / 255,
-            K_B33=frame.K_33,
-            camera_height_m_B=torch.tensor(frame.camera_height_m),
-            camera_pitch_rad_B=torch.tensor(frame.camera_pitch_rad),
-            instance_ids_BHW=frame.instance_ids,
-            depth_m_BHW=frame.depth_m,
-        )
-
-    def _training_sample(self, name: str, frame: DecodedFrame, generator: Generator) -> Batch:
-        ids = frame.instance_ids
-        if ids is None:  # no label file: unlabeled everywhere, so that padding can still be marked
-            ids = torch.zeros(frame.images_N3HW[0].shape[-2:], dtype=torch.int32)
-        view = draw_augmented(frame.images_N3HW, frame.K_33, ids, self._augment, generator)
-        batch = Batch(
-            names=[name],
-            image_B3HW=view.jittered_N3HW[0],
-            K_B33=view.K_33,
-            camera_height_m_B=torch.tensor(frame.camera_height_m),
-            camera_pitch_rad_B=torch.tensor(frame.camera_pitch_rad),
-        )
-        if self.video:
-            batch.context_BN3HW = view.jittered_N3HW[1:]
-            batch.clean_B3HW = view.clean_N3HW[0]
-            batch.clean_context_BN3HW = view.clean_N3HW[1:]
-            batch.reprojection_mask_BHW = ~torch.isin(view.instance_ids_HW, NOT_REPROJECTED)
-        if self.panoptic:
-            targets = panoptic_targets(view.instance_ids_HW.numpy(), self.labels, self.loss)
-            batch.semantic_BHW = torch.from_numpy(targets.semantic)
-            batch.semantic_weight_BHW = torch.from_numpy(targets.semantic_weight)
-            batch.center_B1HW = torch.from_numpy(targets.center)[None]
-            batch.center_weight_B1HW = torch.from_numpy(targets.center_weight)[None]
-            batch.offset_B2HW = torch.from_numpy(targets.offset)
-            batch.offset_weight_B1HW = torch.from_numpy(targets.offset_weight)[None]
-        return batch
+        return sources + [(path, frame_cache.LABELS) for path in labels if self.training]
 
     # --- decoding ---------------------------------------------------------------------------------
 
-    def _read(self, name: str, training: bool) -> DecodedFrame:
+    def read(self, name: str) -> DecodedFrame:
         path = self._image_file(name)
         images = [self.on_disk.read(path, frame_cache.IMAGE)]
         own_size = images[0].own_size
         frame = (path, own_size)
-        if training and self.video:
+        if self._compares:
             around = [self._file(SEQUENCE, files.neighbour(name, step)) for step in (-1, 1)]
             images += [self.on_disk.read(beside, frame_cache.IMAGE, frame) for beside in around]
         camera = files.read_camera(self._file(CAMERA, self._camera_names[name]))
         K = torch.tensor([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
 
-        ids = depth_m = None
-        if self.panoptic or (name in self._label_files and (self.video or not training)):
+        fields: dict[str, torch.Tensor] = {}
+        wanted = "instance_ids" in self.needs
+        ids = None
+        if wanted or (name in self._label_files and (self._compares or not self.training)):
             label_path = self._label_files[name]
-            if training:
+            if self.training:
                 ids = self.on_disk.read(label_path, frame_cache.LABELS, frame).pixels
             else:
                 ids = files.read_instance_ids(label_path)
                 files.check_same_size(label_path, ids.shape, *frame)
-        elif training and self.video and self._ego_mask is not None:
+        elif self._compares and self._ego_mask is not None:
             ids = self._ego_mask
             files.check_same_size(self.root / files.EGO_MASK.suffix, ids.shape, *frame)
             ids = self._to_input(ids, path, cv2.INTER_NEAREST_EXACT)
-        if self.video and not training:
+        ids_HW = None if ids is None else torch.from_numpy(ids.astype(np.int32))
+        if ids_HW is not None and (wanted or not self.training):
+            fields["instance_ids"] = ids_HW
+        if "depth_m" in self.needs:
             depth_path = self._file(DISPARITY, name)
             depth_m = files.read_depth_m(depth_path, camera)
             files.check_same_size(depth_path, depth_m.shape, *frame)
+            if self.training:
+                depth_m = self._to_input(depth_m, depth_path, cv2.INTER_NEAREST_EXACT)
+            fields["depth_m"] = torch.from_numpy(depth_m)
 
         return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
             K_33=scale(K, self.data.width / own_size[1], self.data.height / own_size[0]),
             camera_height_m=camera.height_m,
             camera_pitch_rad=camera.pitch_rad,
-            instance_ids=None if ids is None else torch.from_numpy(ids.astype(np.int32)),
-            depth_m=None if depth_m is None else torch.from_numpy(depth_m),
+            fields=fields,
+            static=ids_HW if self.training else None,
         )
 
     def _to_input(self, array: NDArray, path: Path, interpolation: int) -> NDArray:
@@ -241,7 +182,7 @@ class Cityscapes:
 
     # --- which files ------------------------------------------------------------------------------
 
-    def _folder(self, kind: Kind) -> Path:
+    def _folder(self, kind: Package) -> Path:
         return self.root / kind.folder / self.split
 
     def _file(self, kind: Kind, name: str) -> Path:
@@ -252,8 +193,8 @@ class Cityscapes:
 
     def _find_labels(self) -> dict[str, Path]:
         folders = [self._folder(LABELS)]
-        if self.sequence_labels:
-            folders.insert(0, self.sequence_labels)  # overwritten by the human labels
+        if self.further_labels:
+            folders.insert(0, self.further_labels)  # overwritten by the human labels
         return {
             name: files.file_of(folder, LABELS, name)
             for folder in folders
@@ -277,14 +218,14 @@ class Cityscapes:
                 )
         return cameras
 
-    def _require_files(self, training: bool) -> None:
+    def _require_files(self) -> None:
         needed = [(CAMERA, set(self._camera_names.values()))]
-        if self.panoptic:
+        if "instance_ids" in self.needs:
             needed.append((LABELS, set(self.names)))
-        if self.video and training:
+        if self._compares:
             around = {files.neighbour(name, step) for name in self.names for step in (-1, 1)}
             needed.append((SEQUENCE, around))
-        if self.video and not training:
+        if "depth_m" in self.needs:
             needed.append((DISPARITY, set(self.names)))
         for kind, names in needed:
             labels = kind is LABELS  # which may lie in a second folder

@@ -6,24 +6,32 @@ keeps the shape and pads to 384 x 1280 instead). Ground truth stays at the frame
 """
 
 from collections import Counter
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mtl_bench.core import config
+from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames
+from mtl_bench.core.recipe import Data, Recipe
 from mtl_bench.data import frame_cache, velodyne
 from mtl_bench.data import kitti_files as files
 from mtl_bench.data import kitti_splits as splits
 from mtl_bench.data.augment import scale
-from mtl_bench.data.cityscapes import PLAIN, Cityscapes, DecodedFrame
-from mtl_bench.data.cityscapes_files import check_same_size, read_instance_ids
+from mtl_bench.data.cityscapes_files import (
+    EGO_ID,
+    SKY_ID,
+    check_same_size,
+    read_instance_ids,
+    reprojection_mask,
+)
 from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.kitti_splits import Frame
-from mtl_bench.data.labels import CITYSCAPES19, LabelSet
+from mtl_bench.data.labels import CITYSCAPES19
+from mtl_bench.data.pseudo_frames import KittiFrames
 
 # Which depth maps a frame may have, the first that exists wins
 TRUTHS = {
@@ -34,7 +42,7 @@ TRUTHS = {
 PSEUDO_LABEL = "mtl-bench pseudo-label --checkpoint CITYSCAPES_RUN --data"
 
 
-class Kitti(Cityscapes):
+class Kitti(Dataset):
     """One split: those of its frames that the tree has.
 
     Label files, which `mtl-bench pseudo-label` writes, are training targets and mask the sky. They
@@ -45,58 +53,96 @@ class Kitti(Cityscapes):
         split: train, val or test. Training frames need both neighbours: others are left out.
         data: input size, and by `train_frames` whether the published frames train or all that
             neither val nor test has.
-        labels: the classes.
-        video: the depth task: neighbours in training, depth maps in evaluation.
-        panoptic: the panoptic task: training frames must have labels. Without it they only mask
-            the reprojection, where they exist.
-        augment: random changes of training samples; None for a split that is only evaluated.
-        loss: what the targets depend on.
+        needs: with "instance_ids", training frames must have labels. Without it they only mask
+            what does not move, where they exist.
         truth: depth maps to evaluate on: `improved`, `velodyne` (projected scans), or `default`,
             improved where a frame has one, else velodyne. Frames without are left out.
 
     Attributes:
         published_frames: how many the split has as published, with this truth.
         left_out: frames of the split that are not in use, by why.
-        truths: frames in use by their depth map's kind.
+        truth_counts: frames in use by their depth map's kind.
 
     Raises:
         ValueError: no frame of the split is there, or frames lack labels or calibration.
     """
 
+    labels = CITYSCAPES19
+    fields: ClassVar[Mapping[str, Kind]] = {"instance_ids": Kind.IDS, "depth_m": Kind.DEPTH}
+    truths: ClassVar[tuple[str, ...]] = ("improved", "velodyne")
+    static_ids: ClassVar[tuple[int, ...]] = (EGO_ID, SKY_ID)
+    layout = "KITTI raw"
+
     def __init__(
         self,
         root: Path,
         split: str,
-        data: config.Data,
-        labels: LabelSet = CITYSCAPES19,
+        data: Data,
         *,
-        video: bool,
-        panoptic: bool,
-        augment: config.Augment | None,
-        loss: config.Loss,
+        needs: Collection[str] = (),
+        training: bool = False,
         truth: str = "default",
     ) -> None:
-        self.root, self.split, self.data, self.labels = root, split, data, labels
-        self.video, self.panoptic, self.loss = video, panoptic, loss
-        self._augment, self._ego_mask = augment or PLAIN, None
-        self._cache: dict[tuple[int, bool], DecodedFrame] | None = {} if data.cache else None
+        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
         self.on_disk = FrameCache(root, data, self._to_input)
         self.tree = files.Tree(root)
         self.left_out: Counter[str] = Counter()
         frames = self._present()
-        if video and augment is None:
+        if "depth_m" in self.needs:
             frames = self._with_truth(frames, truth)
         self._frames = {frame.name: frame for frame in frames}
         self.names = list(self._frames)
         self._label_files = {
             frame.name: self.tree.labels(frame) for frame in frames if self.tree.has_labels(frame)
         }
-        if panoptic and augment is not None:
+        if training and "instance_ids" in self.needs:
             self._require_labels()
         self._cameras = {
             (date, camera): files.read_camera(root / date, camera)
             for date, camera in {(frame.date, frame.camera) for frame in frames}
         }
+
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        return root.is_dir() and any(files.is_date(path.name) for path in root.iterdir())
+
+    @classmethod
+    def check(cls, root: Path, deep: bool = False) -> tuple[list[str], int]:
+        from mtl_bench.data.check_kitti import check_kitti
+
+        report = check_kitti(root, deep)
+        return report.summary(), len(report.problems)
+
+    @classmethod
+    def image_files(cls, root: Path, split: str) -> dict[str, Path]:
+        tree = files.Tree(root)
+        listed = splits.frames_of(root, split)
+        found = {frame.name: tree.image(frame) for frame in listed if tree.has_image(frame)}
+        if not found:
+            raise ValueError(f"{root}: no frame of split '{split}' is there")
+        return found
+
+    @classmethod
+    def frames_to_label(
+        cls, root: Path, out: Path | None, split: str, recipe: Recipe
+    ) -> LabelFrames:
+        """All of the split that have an image, or with the split "all" every frame."""
+        return KittiFrames(root, out, split, recipe)
+
+    @property
+    def _compares(self) -> bool:
+        """Whether training frames are compared with their neighbours in time."""
+        return self.training and NEIGHBOURS in self.needs
+
+    @property
+    def static_from(self) -> str:
+        """Labels, none, or both."""
+        return reprojection_mask(len(self.names), len(self._label_files), False)
+
+    @property
+    def knows_static(self) -> bool:
+        """Only labels know where the sky is."""
+        return self.static_from == "labels"
 
     @property
     def described(self) -> dict[str, Any]:
@@ -106,23 +152,25 @@ class Kitti(Cityscapes):
             "frames": len(self),
             "frames_published": None if of_all else self.published_frames,
             **({"left_out": dict(self.left_out)} if self.left_out else {}),
-            **({"depth_truth": dict(self.truths)} if self.truths else {}),
+            **({"depth_truth": dict(self.truth_counts)} if self.truth_counts else {}),
         }
 
-    def sources(self, training: bool) -> list[Source]:
+    def sources(self) -> list[Source]:
         """The files that samples are made of and that `on_disk` can hold."""
         frames = set(self._frames.values())
-        if training and self.video:
+        if self._compares:
             frames |= {frame.later(step) for frame in frames for step in (-1, 1)}
         sources = [(self.tree.image(frame), frame_cache.IMAGE) for frame in sorted(frames)]
-        labels = [(path, frame_cache.LABELS) for path in self._label_files.values() if training]
+        labels = [
+            (path, frame_cache.LABELS) for path in self._label_files.values() if self.training
+        ]
         return sources + labels
 
     # --- which frames -----------------------------------------------------------------------------
 
     def _present(self) -> list[Frame]:
         """The split's frames that are there, in training with both neighbours."""
-        self.truths: Counter[str] = Counter()
+        self.truth_counts: Counter[str] = Counter()
         wanted = splits.frames_of(self.root, self.split)
         self.published_frames = len(wanted)
         choice = self.data.train_frames
@@ -160,8 +208,6 @@ class Kitti(Cityscapes):
         return f"{self.root}: none of the {count} frames of the split {self.split}; {advice}"
 
     def _with_truth(self, frames: list[Frame], truth: str) -> list[Frame]:
-        if truth not in TRUTHS:
-            raise ValueError(f"KITTI has no depth truth '{truth}': it has {', '.join(TRUTHS)}")
         if truth == "improved":
             listed = splits.frames_of(self.root, self.split)
             self.published_frames -= len(splits.without_improved().intersection(listed))
@@ -171,7 +217,7 @@ class Kitti(Cityscapes):
             for frame in frames
         }
         self._truth = {frame: kind for frame, kind in found.items() if kind}
-        self.truths = Counter(self._truth.values())
+        self.truth_counts = Counter(self._truth.values())
         self._leave_out("without depth maps", len(frames) - len(self._truth))
         if not self._truth:
             wanted = " or ".join(TRUTHS[truth])
@@ -193,38 +239,45 @@ class Kitti(Cityscapes):
 
     # --- decoding ---------------------------------------------------------------------------------
 
-    def _read(self, name: str, training: bool) -> DecodedFrame:
+    def read(self, name: str) -> DecodedFrame:
         frame = self._frames[name]
         path = self.tree.image(frame)
         camera = self._cameras[frame.date, frame.camera]
         images = [self.on_disk.read(path, frame_cache.IMAGE)]
         check_calibrated(path, images[0].own_size, camera)
         size = camera.size
-        if training and self.video:
+        if self._compares:
             around = [self.tree.image(frame.later(step)) for step in (-1, 1)]
             whole = (path, size)
             images += [self.on_disk.read(beside, frame_cache.IMAGE, whole) for beside in around]
-        ids = self._read_labels(frame, path, size, training)
-        depth_m = self._read_depth_m(frame, path, camera) if self.video and not training else None
+        fields: dict[str, torch.Tensor] = {}
+        ids = self._read_labels(frame, path, size)
+        ids_HW = None if ids is None else torch.from_numpy(ids.astype(np.int32))
+        if ids_HW is not None and ("instance_ids" in self.needs or not self.training):
+            fields["instance_ids"] = ids_HW
+        if "depth_m" in self.needs:
+            depth_m = self._read_depth_m(frame, path, camera)
+            if self.training:
+                depth_m = self._to_input(depth_m, path, cv2.INTER_NEAREST_EXACT)
+            fields["depth_m"] = torch.from_numpy(depth_m)
         K_33 = torch.from_numpy(camera.K_33).float()
         return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
             K_33=scale(K_33, self.data.width / size[1], self.data.height / size[0]),
             camera_height_m=files.CAMERA_HEIGHT_M,
-            camera_pitch_rad=0.0,
-            instance_ids=None if ids is None else torch.from_numpy(ids.astype(np.int32)),
-            depth_m=None if depth_m is None else torch.from_numpy(depth_m),
+            fields=fields,
+            static=ids_HW if self.training else None,
         )
 
     def _read_labels(
-        self, frame: Frame, path: Path, size: tuple[int, int], training: bool
+        self, frame: Frame, path: Path, size: tuple[int, int]
     ) -> NDArray[np.uint16] | None:
         """At the input's size in training; in evaluation only true ones, which all frames have."""
         true = len(self._label_files) == len(self) and not self.tree.predicted_labels
-        if frame.name not in self._label_files or not (training or true):
+        if frame.name not in self._label_files or not (self.training or true):
             return None
         label_path = self._label_files[frame.name]
-        if training:
+        if self.training:
             return self.on_disk.read(label_path, frame_cache.LABELS, (path, size)).pixels
         ids = read_instance_ids(label_path)
         check_same_size(label_path, ids.shape, path, size)

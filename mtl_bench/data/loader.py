@@ -7,19 +7,13 @@ A run that starts at any step, in one process or several, therefore sees the sam
 import hashlib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
 
 import cv2
 import torch
 from torch import Generator, Tensor
 
-from mtl_bench.core.config import Cell, did_you_mean
-from mtl_bench.data.batch import Batch, collate
-from mtl_bench.data.cityscapes import Cityscapes
-from mtl_bench.data.kitti import Kitti
-from mtl_bench.data.labels import labels_of
-from mtl_bench.data.layouts import KITTI, LAYOUTS
+from mtl_bench.core.batch import Batch, collate
+from mtl_bench.data.samples import Samples
 
 # Batches that each worker has ready or under way. One is enough: a worker goes on as soon as its
 # batch is fetched, and every further one takes a batch's memory (1.3 GB at the paper's size).
@@ -27,59 +21,8 @@ AHEAD = 1
 _DIED = "DataLoader worker (pid"  # how torch's error begins
 
 
-def open_dataset(
-    cell: Cell,
-    split: str,
-    root: Path,
-    training: bool,
-    sequence_labels: Path | None = None,
-    truth: str = "default",
-) -> Cityscapes:
-    """The split as the cell's recipe and tasks want it.
-
-    Args:
-        sequence_labels: of the video stage, see `Cityscapes`; KITTI has none.
-        truth: depth to evaluate on. Cityscapes: disparity; KITTI: see `Kitti`; default: either's.
-
-    Raises:
-        ValueError: an unknown data set, or a folder that lacks what the tasks need.
-    """
-    recipe = cell.recipe
-    layout = LAYOUTS.get(recipe.data.dataset)
-    if layout is None:
-        known = did_you_mean(recipe.data.dataset, LAYOUTS)
-        raise ValueError(f"no data set called '{recipe.data.dataset}'{known}")
-    tasks = {"video": "depth" in cell.tasks, "panoptic": "panoptic" in cell.tasks}
-    augment = recipe.augment if training else None
-    labels = labels_of(recipe.data.dataset)
-    if layout == KITTI:
-        assert sequence_labels is None, "pseudo_labels.ensure makes none"
-        return Kitti(
-            root,
-            split,
-            recipe.data,
-            labels,
-            **tasks,
-            augment=augment,
-            loss=recipe.loss,
-            truth=truth,
-        )
-    if truth not in ("default", "disparity"):
-        raise ValueError(f"{recipe.data.dataset} has no depth truth '{truth}': it has disparity")
-    return Cityscapes(
-        root,
-        split,
-        recipe.data,
-        labels,
-        **tasks,
-        augment=augment,
-        loss=recipe.loss,
-        sequence_labels=sequence_labels,
-    )
-
-
 def train_batches(
-    dataset: Cityscapes,
+    samples: Samples,
     batch_size: int,
     seed: int,
     start_step: int = 0,
@@ -91,7 +34,7 @@ def train_batches(
     Every epoch is a new order of the whole split; what is left of it after full batches is dropped.
 
     Args:
-        dataset: a training split.
+        samples: of a training split.
         batch_size: samples a batch.
         seed: the run's seed.
         start_step: the first batch to yield; how a stopped run goes on.
@@ -102,50 +45,47 @@ def train_batches(
         ValueError: a batch larger than the split; while iterating, a broken file, or workers that
             the system ended.
     """
-    if not 0 < batch_size <= len(dataset):
+    if not 0 < batch_size <= len(samples):
         raise ValueError(
-            f"a batch of {batch_size} from {len(dataset)} frames; set recipe.optim.batch to at "
+            f"a batch of {batch_size} from {len(samples)} frames; set recipe.optim.batch to at "
             f"most that"
         )
-    steps = _Steps(len(dataset), batch_size, seed, start_step)
+    steps = _Steps(len(samples), batch_size, seed, start_step)
     if workers == 0:
-        return (collate(list(_samples(dataset, slots))) for slots in steps)
-    return _from_workers(dataset.uncached(), steps, workers, pinned)
+        return (collate(list(_drawn(samples, slots))) for slots in steps)
+    return _from_workers(samples.uncached(), steps, workers, pinned)
 
 
-def eval_batches(dataset: Cityscapes, batch_size: int) -> Iterator[Batch]:
+def eval_batches(samples: Samples, batch_size: int) -> Iterator[Batch]:
     """The whole split in order, without augmentation.
 
     A batch is smaller where the split ends, or where the next frame's truth has another size.
     """
-    samples: list[Batch] = []
-    for index in range(len(dataset)):
-        sample = dataset.sample(index, None)
-        if samples and (len(samples) == batch_size or _sizes(sample) != _sizes(samples[0])):
-            yield collate(samples)
-            samples = []
-        samples.append(sample)
-    if samples:
-        yield collate(samples)
+    taken: list[Batch] = []
+    for index in range(len(samples)):
+        sample = samples.sample(index, None)
+        if taken and (len(taken) == batch_size or _sizes(sample) != _sizes(taken[0])):
+            yield collate(taken)
+            taken = []
+        taken.append(sample)
+    if taken:
+        yield collate(taken)
 
 
-def _sizes(sample: Batch) -> list[torch.Size | None]:
-    truths = (sample.instance_ids_BHW, sample.depth_m_BHW)
-    return [None if truth is None else truth.shape for truth in truths]
+def _sizes(sample: Batch) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in sample.fields.items()}
 
 
 Slot = tuple[int, int]  # index of a sample, seed of its augmentation
 
 
-def _samples(dataset: Cityscapes, slots: list[Slot]) -> Iterator[Batch]:
-    return (dataset.sample(index, Generator().manual_seed(seed)) for index, seed in slots)
+def _drawn(samples: Samples, slots: list[Slot]) -> Iterator[Batch]:
+    return (samples.sample(index, Generator().manual_seed(seed)) for index, seed in slots)
 
 
-def _from_workers(
-    dataset: Cityscapes, steps: "_Steps", workers: int, pinned: bool
-) -> Iterator[Batch]:
+def _from_workers(samples: Samples, steps: "_Steps", workers: int, pinned: bool) -> Iterator[Batch]:
     loader = torch.utils.data.DataLoader(
-        _Batches(dataset),
+        _Batches(samples),
         sampler=steps,
         batch_size=None,  # an item is a whole batch
         num_workers=workers,
@@ -167,35 +107,35 @@ def _from_workers(
             ) from error
         if isinstance(fields, ValueError):
             raise fields
-        yield Batch(**fields)
+        yield Batch.from_tensors(*fields)
 
 
 class _Batches(torch.utils.data.Dataset):
-    def __init__(self, dataset: Cityscapes) -> None:
-        self.dataset = dataset
+    def __init__(self, samples: Samples) -> None:
+        self.samples = samples
 
-    def __getitem__(self, slots: list[Slot]) -> dict[str, Any] | ValueError:
-        """A batch's fields, or what is wrong with a file: torch would bury that line in a
+    def __getitem__(self, slots: list[Slot]) -> tuple[list[str], dict[str, Tensor]] | ValueError:
+        """A batch's names and tensors, or what is wrong with a file: torch would bury that line in a
         traceback. A plain dictionary is what torch knows how to pin."""
         try:
-            return _collate_shared(_samples(self.dataset, slots), len(slots))
+            return _collate_shared(_drawn(self.samples, slots), len(slots))
         except ValueError as error:
             return error
 
 
-def _collate_shared(samples: Iterable[Batch], count: int) -> dict[str, Any]:
+def _collate_shared(samples: Iterable[Batch], count: int) -> tuple[list[str], dict[str, Tensor]]:
     """As `collate`, but straight into the memory that processes share, and sample by sample: one
     copy less, and not all samples beside the batch, which takes a gigabyte of Cityscapes' frames.
     """
-    fields: dict[str, Any] = {"names": []}
+    names: list[str] = []
+    tensors: dict[str, Tensor] = {}
     for slot, sample in enumerate(samples):
-        fields["names"] += sample.names
-        for name, value in vars(sample).items():
-            if isinstance(value, Tensor):
-                if slot == 0:
-                    fields[name] = _shared(count, value)
-                fields[name][slot] = value
-    return fields
+        names += sample.names
+        for name, value in sample.tensors().items():
+            if slot == 0:
+                tensors[name] = _shared(count, value)
+            tensors[name][slot] = value
+    return names, tensors
 
 
 def _shared(count: int, like: Tensor) -> Tensor:

@@ -1,49 +1,52 @@
 """A model on a split -> metrics, their protocol and a few pictures. Never trains, never picks.
 
-Predictions are compared at the size of the ground truth, by the protocols that the recipe names.
-Depth errors are reported twice: `depth_median` scales each image by the ratio of medians (it looks
-at the truth), `depth_dgc` by the camera's height above the predicted road (it does not).
+Results are compared at the size of the ground truth, by the protocols that the recipe names. A walk
+goes over one split with one truth; protocols that share both share the walk.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mtl_bench.core import config
-from mtl_bench.core.geometry import depth_from_inverse
-from mtl_bench.data.batch import Batch
-from mtl_bench.data.cityscapes import Cityscapes
-from mtl_bench.data.labels import LabelSet, labels_of
-from mtl_bench.data.loader import eval_batches, open_dataset
-from mtl_bench.evaluate.collector import (
-    Collector,
-    DepthScore,
-    Evaluation,
-    Prediction,
-    add_depth,
-    true_size,
-)
-from mtl_bench.model import Model, Outputs
-from mtl_bench.tasks.depth import protocols
-from mtl_bench.tasks.panoptic import postprocess
+from mtl_bench.core.batch import Batch
+from mtl_bench.core.task import Metric, Results, Size, Task, finish
+from mtl_bench.data.loader import eval_batches
+from mtl_bench.data.samples import Samples, open_samples
+from mtl_bench.model import Model
 
-__all__ = ["Collector", "Evaluation", "Prediction", "Progress", "evaluate", "evaluating"]
-__all__ += ["open_passes", "predict", "true_size"]
+PICTURES = 4  # frames kept for the report, at fixed places of the split
 
 Progress = Callable[[int, int], None]  # frames done, frames in all
+Picture = dict[str, Any]  # a frame and its maps [H,W,...]
 
 
-@dataclass(frozen=True)
-class Pass:
+@dataclass
+class Evaluation:
+    """What an evaluation hands on: numbers, how they were made, and frames to look at."""
+
+    metrics: dict[str, float]  # flat and dotted; undefined ones (no such class or pixel) are absent
+    protocol: dict[str, Any]
+    samples: dict[str, Any] = field(default_factory=dict)  # names, and arrays [n,H,W,...]; the
+    # same with keys `extremes.*` for the worst and the best frame, with their score
+
+
+@dataclass
+class Walk:
     """One walk over a split."""
 
-    measured: list[protocols.Protocol]
-    cell: config.Cell  # with the tasks that are needed
-    dataset: Cityscapes
+    split: str
+    tasks: tuple[Task, ...]  # those that are measured, and those whose results they read
+    measured: list[tuple[Task, Metric]]
+    samples: Samples
 
 
 def evaluate(
@@ -54,107 +57,226 @@ def evaluate(
     split: str | None = None,
     batch_size: int = 8,
     progress: Progress | None = None,
-    labels: LabelSet | None = None,
 ) -> Evaluation:
     """Evaluate in float32 by the recipe's protocols.
 
     Args:
         split: in place of the protocols' own.
-        progress: told the frames done and in all, over all passes.
-        labels: None: the data set's.
+        progress: told the frames done and in all, over all walks.
 
     Raises:
         ValueError: a split without ground truth, or a prediction that is not finite.
     """
-    labels = labels or labels_of(cell.recipe.data.dataset)
-    main, *others = open_passes(cell, root, split)
-    done, total = 0, sum(len(each.dataset) for each in (main, *others))
+    walks = open_walks(cell.recipe, model.tasks, root, split)
 
-    def predictions(each: Pass) -> Iterator[tuple[Batch, Prediction]]:
-        nonlocal done
-        for batch in eval_batches(each.dataset, batch_size):
-            batch = batch.to(device)
-            yield batch, predict(model, batch, each.cell, labels, true_size(batch))
-            done += len(batch.names)
-            if progress:
-                progress(done, total)
+    def results(batch: Batch, tasks: Sequence[Task]) -> dict[str, Results]:
+        return predict(model, batch.to(device), tasks, true_size(batch))
 
-    collector = Collector(cell, labels, len(main.dataset), main.measured)
-    further: list[DepthScore] = []
     with evaluating(model), torch.inference_mode():
-        for batch, prediction in predictions(main):
-            collector.update(batch, prediction)
-        for other in others:
-            scores = [DepthScore(protocol) for protocol in other.measured]
-            for batch, prediction in predictions(other):
-                for slot in range(len(batch.names)):
-                    add_depth(scores, batch, prediction, slot)
-            further += scores
-    return collector.result(main.measured[0].split, device, further)
+        return measure(cell, walks, results, device, batch_size, progress)
 
 
-def open_passes(cell: config.Cell, root: Path, split: str | None = None) -> list[Pass]:
-    """The walks that a cell's evaluation takes, the main protocol's first; decodes nothing.
+def open_walks(
+    recipe: config.Recipe, tasks: Sequence[Task], root: Path, split: str | None = None
+) -> list[Walk]:
+    """The walks that an evaluation takes, the main one first; decodes nothing.
 
     Worth a call before training: it finds what would stop the evaluation after it.
 
     Raises:
         ValueError: a protocol that the data set cannot serve, or a split that lacks its files.
     """
-    opened: list[Pass] = []
-    for measured in protocols.passes(protocols.of_cell(cell, split)):
-        own = cell
-        if opened and not any("dgc" in protocol.scalings for protocol in measured):
-            own = replace(cell, tasks=("depth",), single_task=False, video=False)  # no road needed
-        first = measured[0]
-        dataset = open_dataset(own, first.split, root, training=False, truth=first.truth)
-        opened.append(Pass(measured, own, dataset))
-    return opened
+    metrics = [(task, metric) for task in tasks for metric in task.metrics(split)]
+    main = split or recipe.evaluate.split
+    mains = [metric for _, metric in metrics if not metric.prefix]
+    truth = next((metric.truth for metric in mains if metric.truth != "default"), "default")
+    groups: dict[tuple[str, str], list[tuple[Task, Metric]]] = {(main, truth): []}
+    for task, metric in metrics:
+        any_truth = metric.truth == "default"
+        place = (metric.split, truth if any_truth else metric.truth)
+        groups.setdefault(place, []).append((task, metric))
+    return [
+        Walk(
+            place[0],
+            needed,
+            measured,
+            open_samples(recipe, needed, place[0], root, False, truth=place[1]),
+        )
+        for place, measured in groups.items()
+        for needed in [_needed(tasks, measured)]
+    ]
+
+
+def _needed(tasks: Sequence[Task], measured: Sequence[tuple[Task, Metric]]) -> tuple[Task, ...]:
+    """The measured tasks and, where a metric depends on them, those whose results they read."""
+    names = {task.name for task, _ in measured}
+    for task, metric in measured:
+        names |= set(task.after) if metric.reads_others else set()
+    return tuple(task for task in tasks if task.name in names)
 
 
 def predict(
-    model: Model, batch: Batch, cell: config.Cell, labels: LabelSet, size: tuple[int, int]
-) -> Prediction:
-    """Run the network and the post-processing; the depth's scale is found at the input's size."""
-    outputs = model.net(batch.image_B3HW)
-    if "depth" in cell.tasks and cell.recipe.evaluate.flip:
-        outputs = _flip_averaged(model, batch.image_B3HW, outputs)
-    result = Prediction()
-    road_BHW = None
-    if "panoptic" in cell.tasks:
-        road_BHW = outputs.semantic_BCHW.argmax(1) == labels.index("road")
-    if "depth" in cell.tasks:
-        depth_B1HW = depth_from_inverse(outputs.inverse_depth[0].float())
-        if not depth_B1HW.isfinite().all():
-            raise ValueError(f"the predicted depth is not finite in a frame of {batch.names}")
-        result.dgc_scale_B, result.dgc_source_B = postprocess.dgc_scale(
-            depth_B1HW,
-            batch.K_B33,
-            batch.camera_height_m_B,
-            road_BHW,
-            pitch_rad_B=batch.camera_pitch_rad_B,
-        )
-    if size != tuple(batch.image_B3HW.shape[2:]):
-        outputs = postprocess.resize(outputs, *size)
-    if "depth" in cell.tasks:
-        result.depth_B1HW = depth_from_inverse(outputs.inverse_depth[0].float())
-    if "panoptic" in cell.tasks:
-        result.class_BHW = outputs.semantic_BCHW.argmax(1)
-        panoptic_BHW = postprocess.panoptic(
-            result.class_BHW,
-            outputs.center_B1HW,
-            outputs.offset_B2HW,
-            labels.things,
-            cell.recipe.evaluate,
-        )
-        result.instance_ids_BHW = postprocess.to_instance_ids(panoptic_BHW, labels)
-    return result
+    model: Model, batch: Batch, tasks: Sequence[Task], size: Size | None = None
+) -> dict[str, Results]:
+    """Run the network and the post-processing.
+
+    Args:
+        size: of the results; None: the input's.
+
+    Raises:
+        ValueError: a predicted map that is not a number.
+    """
+    assert batch.camera is not None
+    maps = model.net(batch.image_B3HW).maps
+    if any(task.recipe.evaluate.flip and task.averages_flip for task in tasks):
+        mirrored = model.net(batch.image_B3HW.flip(-1)).maps
+        averaged = {
+            task.name: task.flip_averaged(maps[task.name], mirrored[task.name]) for task in tasks
+        }
+        maps = maps | averaged
+    for task in tasks:
+        if any(map_.isnan().any() for map_ in maps[task.name].values()):
+            raise ValueError(f"the predicted {task.name} is not finite in a frame of {batch.names}")
+    return finish(tasks, maps, batch.camera, size)
 
 
-def _flip_averaged(model: Model, image_B3HW: Tensor, outputs: Outputs) -> Outputs:
-    """The finest inverse depth averaged with that of the mirrored image; all else as it is."""
-    mirrored = model.net(image_B3HW.flip(-1)).inverse_depth[0].flip(-1)
-    return replace(outputs, inverse_depth=[(outputs.inverse_depth[0] + mirrored) / 2])
+# --- adding up ------------------------------------------------------------------------------------
+
+
+def measure(
+    cell: config.Cell,
+    walks: Sequence[Walk],
+    results: Callable[[Batch, Sequence[Task]], dict[str, Results]],
+    device: torch.device,
+    batch_size: int = 8,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Walk and compare with the truth.
+
+    Args:
+        results: a batch's results of some tasks, by task, at the size of its truth.
+    """
+    done, total = 0, sum(len(walk.samples) for walk in walks)
+    gallery = Gallery(len(walks[0].samples))
+    input_size: Size = (0, 0)
+    sizes: dict[Size, None] = {}
+    for walk in walks:
+        main = walk is walks[0]
+        for batch in eval_batches(walk.samples, batch_size):
+            found = results(batch, walk.tasks)
+            if main:
+                input_size = (batch.image_B3HW.shape[2], batch.image_B3HW.shape[3])
+                sizes[true_size(batch)] = None
+            for slot, name in enumerate(batch.names):
+                picture: Picture = {"names": name}
+                for task, metric in walk.measured:
+                    seen = metric.update(
+                        frame_truth(task, batch, slot), _frame(found[task.name], slot)
+                    )
+                    picture = {**seen, **picture}
+                if main:
+                    gallery.add({**picture, "image": _picture(batch, slot)})
+            done += len(batch.names)
+            if progress:
+                progress(done, total)
+    metrics: dict[str, float] = {}
+    for walk in walks:
+        for _, metric in walk.measured:
+            metrics |= metric.compute()
+    protocol = _protocol(cell, walks, input_size, sizes, device)
+    return Evaluation(metrics, protocol, gallery.samples())
+
+
+def frame_truth(task: Task, batch: Batch, slot: int) -> dict[str, NDArray[Any]]:
+    """What a task is compared with, of one frame of a batch."""
+    return {
+        name: batch.fields[name][slot].cpu().numpy() for name in task.truth if name in batch.fields
+    }
+
+
+def _frame(results: Results, slot: int) -> dict[str, NDArray[Any]]:
+    return {name: value[slot].cpu().numpy() for name, value in results.items()}
+
+
+class Gallery:
+    """Frames to look at: some at fixed places of the split, and the worst and the best.
+
+    Args:
+        total: frames of the split.
+    """
+
+    def __init__(self, total: int) -> None:
+        places = np.linspace(0, total - 1, min(PICTURES, total)).round().astype(int)
+        self._places, self._seen = set(places.tolist()), 0
+        self._chosen: list[Picture] = []
+        self._extremes: list[Picture] = []  # ordered by score
+
+    def add(self, picture: Picture) -> None:
+        """The next frame; a number among its arrays is its score."""
+        scores = [key for key, value in picture.items() if isinstance(value, float)]
+        plain = {key: value for key, value in picture.items() if key not in scores}
+        if self._seen in self._places:
+            self._chosen.append(plain)
+        if scores and not np.isnan(picture[scores[0]]):
+            scored = {**plain, scores[0]: picture[scores[0]]}
+            ordered = sorted([*self._extremes, scored], key=lambda frame: frame[scores[0]])
+            self._extremes = [ordered[0], ordered[-1]] if len(ordered) > 2 else ordered
+        self._seen += 1
+
+    def samples(self) -> dict[str, Any]:
+        extremes = {f"extremes.{key}": value for key, value in _stacked(self._extremes).items()}
+        return _stacked(self._chosen) | extremes
+
+
+def _protocol(
+    cell: config.Cell,
+    walks: Sequence[Walk],
+    input_size: Size,
+    sizes: Iterable[Size],
+    device: torch.device,
+) -> dict[str, Any]:
+    main, dataset, ev = walks[0], walks[0].samples.dataset, cell.recipe.evaluate
+    compared = [list(size) for size in sizes]
+    protocol: dict[str, Any] = {
+        "name": ev.protocol,
+        "dataset": cell.recipe.data.dataset,
+        "split": main.split,
+        "published_frames": dataset.published.get(main.split),
+    }
+    for _, metric in main.measured:
+        if not metric.prefix:
+            protocol |= metric.record()
+    protocol |= {
+        "split": main.split,
+        "frames": len(main.samples),
+        "input": list(input_size),
+        "compared_at": compared[0] if len(compared) == 1 else compared,
+        "engine": "eager",
+        "precision": "fp32",
+        "device": device.type,
+        "ignored_classes": [label.name for label in dataset.labels.labels if not label.evaluated],
+    }
+    for task in main.tasks:
+        protocol |= task.protocol([other.name for other in main.tasks])
+    others = [(walk, metric) for walk in walks for _, metric in walk.measured if metric.prefix]
+    if others:
+        protocol["also"] = {m.prefix.removesuffix("."): m.record() for _, m in others}
+    return protocol
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+def true_size(batch: Batch) -> Size:
+    """Of the truth, height and width.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for truth in batch.fields.values():
+        if truth.dim() >= 3:
+            return int(truth.shape[-2]), int(truth.shape[-1])
+    raise ValueError(f"no ground truth for {batch.names[0]}: choose a split that has it")
 
 
 @contextlib.contextmanager
@@ -167,3 +289,28 @@ def evaluating(model: nn.Module) -> Iterator[None]:
     finally:
         for module, mode in modes:
             module.training = mode
+
+
+def _picture(batch: Batch, slot: int) -> NDArray[np.uint8]:
+    """The input image [H,W,3] at the size of the ground truth."""
+    image: Tensor = batch.image_B3HW[slot : slot + 1]
+    if true_size(batch) != tuple(image.shape[2:]):
+        image = F.interpolate(image, true_size(batch), mode="bilinear", align_corners=False)
+    return (image[0] * 255).round().clamp(0, 255).byte().permute(1, 2, 0).cpu().numpy()
+
+
+def _stacked(pictures: list[Picture]) -> dict[str, Any]:
+    """What all have, key by key: lists of names and numbers, arrays of one size."""
+    keys = [key for key in (pictures or [{}])[0] if all(key in picture for picture in pictures)]
+    columns = {key: [picture[key] for picture in pictures] for key in keys}
+    return {
+        key: np.stack(_of_one_size(values)) if isinstance(values[0], np.ndarray) else values
+        for key, values in columns.items()
+    }
+
+
+def _of_one_size(pictures: list[NDArray]) -> list[NDArray]:
+    """All at the first one's size: frames may differ by some pixels, a report's must not."""
+    height, width = pictures[0].shape[:2]
+    rows, columns = np.arange(height)[:, None], np.arange(width)
+    return [p[rows * p.shape[0] // height, columns * p.shape[1] // width] for p in pictures]

@@ -6,6 +6,7 @@ and shapes; InPlaceABN scales by |gamma| + eps, BatchNorm by gamma.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -75,7 +76,7 @@ class Decoder(nn.Module):
         fused: width of the output; the paper's 256.
     """
 
-    def __init__(self, inputs: tuple[int, int, int], channels: int, fused: int):
+    def __init__(self, inputs: tuple[int, ...], channels: int, fused: int):
         super().__init__()
         skip, middle, deep = inputs
         self.arm_deep = AttentionRefinement(deep, channels)
@@ -84,7 +85,7 @@ class Decoder(nn.Module):
         self.refine_middle = ConvNorm(channels, channels, 3)
         self.fusion = FeatureFusion(skip + channels, fused)
 
-    def forward(self, pyramid: list[Tensor], context_BC11: Tensor) -> list[Tensor]:
+    def forward(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> list[Tensor]:
         """Finest first: the output, and the two inner maps that auxiliary depth heads read."""
         skip, middle, deep = pyramid
         inner_deep = self.arm_deep(deep) + context_BC11
@@ -110,3 +111,22 @@ def init_fan_in(module: nn.Module) -> None:
             nn.init.normal_(layer.weight, std=fan_in**-0.5)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
+
+
+def full(tensor: Tensor) -> Tensor:
+    """At least float32, whatever autocast made of it."""
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+class Normalize(nn.Module):
+    """RGB in [0, 1] -> zero mean, unit variance per channel of the pre-training images."""
+
+    def __init__(self, mean: tuple[float, ...], std: tuple[float, ...]):
+        super().__init__()
+        self.register_buffer("mean_311", torch.tensor(mean).view(3, 1, 1), persistent=False)
+        self.register_buffer("std_311", torch.tensor(std).view(3, 1, 1), persistent=False)
+        self.mean_311: Tensor
+        self.std_311: Tensor
+
+    def forward(self, image_B3HW: Tensor) -> Tensor:
+        return (image_B3HW - self.mean_311) / self.std_311

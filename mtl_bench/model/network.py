@@ -1,10 +1,10 @@
-"""The multi-task network: one backbone, one context module, a decoder and heads per task.
+"""The multi-task network: one backbone, one context module, and what each task brings.
 
 Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021), section 3.1 and figure 2.
-Shapes: B images, C classes, H x W input pixels.
+Shapes: B images, C channels, H x W input pixels, h x w cells of the finest stride.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,112 +12,149 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, plugins
-from mtl_bench.core.backbone import Backbone, Normalize
-from mtl_bench.data.labels import LabelSet
-from mtl_bench.model.layers import Decoder, GlobalContext, Head, init_fan_in
-from mtl_bench.tasks.depth.pose import PoseNetwork
+from mtl_bench.core.backbone import Backbone
+from mtl_bench.core.batch import Batch
+from mtl_bench.core.task import Maps, Task, TaskHead
+from mtl_bench.model.layers import GlobalContext, Normalize, init_fan_in
 
 
 @dataclass
 class Outputs:
-    """Predictions at the input's size; what a task that was not asked for would fill is None."""
+    """Every task's maps at the input's size, float32, and in training what the decoders read."""
 
-    semantic_BCHW: Tensor | None = None  # logits
-    center_B1HW: Tensor | None = None  # in [0, 1]
-    offset_B2HW: Tensor | None = None  # (y, x) to the instance's center, pixels
-    inverse_depth: list[Tensor] = field(default_factory=list)  # each B1HW, finest first
-    representation: list[Tensor] = field(default_factory=list)  # in training: what decoders read
+    maps: dict[str, Maps] = field(default_factory=dict)  # by task
+    representation: list[Tensor] = field(default_factory=list)
 
 
 class Network(nn.Module):
-    """What runs at inference. In training mode it also predicts the auxiliary depth maps."""
+    """What runs at inference. In training mode it also predicts what only losses read."""
 
-    def __init__(
-        self, backbone: Backbone, sizes: config.Network, classes: int, tasks: tuple[str, ...]
-    ):
+    def __init__(self, backbone: Backbone, sizes: config.Network, tasks: Sequence[Task]):
         super().__init__()
         self.normalize = Normalize(backbone.mean, backbone.std)
         self.backbone = backbone
         self.strides = sizes.strides
-        self.min_depth = sizes.min_depth
         inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
         assert len(inputs) == 3
         self.context = GlobalContext(inputs[2], sizes.channels)
         init_fan_in(self.context)
+        self.tasks = tuple(tasks)
+        # All decoders come before all heads, under names of their own: so checkpoints have them.
+        self.decoders, self.heads = nn.ModuleDict(), nn.ModuleDict()
+        self._parts: dict[str, TaskHead] = {}
+        for task in tasks:
+            part = task.head(inputs, sizes)
+            for own, ours in ((part.decoders, self.decoders), (part.heads, self.heads)):
+                taken = own.keys() & ours.keys()
+                if taken:
+                    raise ValueError(
+                        f"task '{task.name}' names a decoder or head '{taken.pop()}', as another "
+                        f"task does: rename it"
+                    )
+                ours.update(own)
+            self._parts[task.name] = part
 
-        def decoder() -> Decoder:
-            return Decoder(inputs, sizes.channels, sizes.fused)
+    def features(self, normalized_B3HW: Tensor) -> tuple[list[Tensor], Tensor]:
+        """What decoders read of a normalised image: the pyramid, finest first, and the context."""
+        features = self.backbone(normalized_B3HW)
+        pyramid = [features[stride] for stride in self.strides]
+        return pyramid, self.context(pyramid[2])
 
-        self.decoders = nn.ModuleDict()
-        self.heads = nn.ModuleDict()
-        if "panoptic" in tasks:
-            self.decoders["semantic"] = decoder()
-            self.decoders["instance"] = decoder()
-            self.heads["semantic"] = Head(sizes.fused, sizes.head, classes)
-            self.heads["center"] = Head(sizes.fused, sizes.head, 1)
-            self.heads["offset"] = Head(sizes.fused, sizes.head, 2)
-            init_fan_in(self.decoders)
-            init_fan_in(self.heads)
-        if "depth" in tasks:
-            self.decoders["depth"] = decoder()
-            widths = (sizes.fused, sizes.channels, sizes.channels)
-            self.heads["depth"] = nn.ModuleList(Head(width, sizes.head, 1) for width in widths)
+    def raw(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> dict[str, Maps]:
+        """Every task's raw maps [B,C,h,w]."""
+        return {
+            name: part.forward(pyramid, context_BC11, auxiliary=self.training)
+            for name, part in self._parts.items()
+        }
 
     def forward(self, image_B3HW: Tensor) -> Outputs:
-        size = image_B3HW.shape[2:]
-        features = self.backbone(self.normalize(image_B3HW))
-        pyramid = [features[stride] for stride in self.strides]
-        context = self.context(pyramid[2])
+        pyramid, context = self.features(self.normalize(image_B3HW))
         outputs = Outputs()
         if self.training:
             # Views: a gradient with respect to the last level then leaves out its way through the
             # context module, which has a gradient of its own.
             *pyramid, context = (x.view_as(x) for x in (*pyramid, context))
             outputs.representation = [*pyramid, context]
-        if "semantic" in self.decoders:
-            semantic = self.decoders["semantic"](pyramid, context)[0]
-            instance = self.decoders["instance"](pyramid, context)[0]
-            outputs.semantic_BCHW = _resize(self.heads["semantic"](semantic), size)
-            outputs.center_B1HW = _resize(self.heads["center"](instance).sigmoid(), size)
-            offset = _resize(self.heads["offset"](instance), size)
-            outputs.offset_B2HW = offset * self.strides[0]  # the head's unit is one feature cell
-        if "depth" in self.decoders:
-            maps = self.decoders["depth"](pyramid, context)
-            heads = list(self.heads["depth"])  # type: ignore[call-overload]
-            for features_BCHW, head in zip(
-                maps, heads if self.training else heads[:1], strict=False
-            ):
-                inverse = head(features_BCHW).sigmoid() / self.min_depth
-                outputs.inverse_depth.append(_resize(inverse, size))
+        raw = self.raw(pyramid, context)
+        for task in self.tasks:
+            maps = task.activate(raw[task.name])
+            outputs.maps[task.name] = {
+                name: _resize(map_, image_B3HW.shape[2:]) for name, map_ in maps.items()
+            }
         return outputs
 
 
-class Model(nn.Module):
-    """The network and, where depth is trained, the pose network; says which weights are whose."""
+class SideBySide(nn.Module):
+    """Networks that were each trained alone on one task, on the same image one after another."""
 
-    def __init__(self, net: Network, pose: PoseNetwork | None):
+    def __init__(self, networks: Iterable[Network]):
+        super().__init__()
+        self.networks = nn.ModuleList(networks)
+
+    def forward(self, image_B3HW: Tensor) -> Outputs:
+        merged = Outputs()
+        for network in self.networks:
+            merged.maps |= network(image_B3HW).maps
+        return merged
+
+
+class Model(nn.Module):
+    """The network and what only training needs; says which weights are whose."""
+
+    def __init__(self, net: nn.Module, tasks: Sequence[Task]):
         super().__init__()
         self.net = net
-        self.pose = pose
+        self.tasks = tuple(tasks)
+        self._extra: dict[str, dict[str, nn.Module]] = {}
+        self._extra_names: list[str] = []
+
+    def add_extra(self, task: Task, modules: dict[str, nn.Module]) -> None:
+        """Networks that a task trains with; they are the model's under their own names."""
+        for name, module in modules.items():
+            self.add_module(name, module)
+            self._extra_names.append(name)
+        self._extra[task.name] = modules
+
+    def forward(self, batch: Batch) -> Outputs:
+        """The network on a batch, and beside it what else tasks predict of it in training."""
+        outputs: Outputs = self.net(batch.image_B3HW)
+        for task in self.tasks:
+            extra = self._extra.get(task.name)
+            if extra:
+                outputs.maps[task.name] |= task.training_maps(extra, batch)
+        return outputs
+
+    def losses(self, outputs: Outputs, batch: Batch) -> dict[str, Tensor]:
+        """The terms of all tasks that have labels, in at least float32 whatever autocast does."""
+        values: dict[str, Tensor] = {}
+        with torch.autocast(batch.device.type, enabled=False):
+            for task in self.tasks:
+                values |= task.losses(outputs.maps[task.name], batch)
+        return values
 
     def shared_parameters(self) -> Iterator[nn.Parameter]:
         """Encoder and context module: what all tasks train."""
+        assert isinstance(self.net, Network)
         yield from self.net.backbone.parameters()
         yield from self.net.context.parameters()
 
     def task_parameters(self) -> Iterator[nn.Parameter]:
-        """Decoders, heads and the pose network: each trained by one task only."""
+        """Decoders, heads and further networks: each trained by one task only."""
         yield from self.head_parameters()
-        if self.pose is not None:
-            yield from self.pose.parameters()
+        for module in self.extra_modules():
+            yield from module.parameters()
+
+    def extra_modules(self) -> Iterator[nn.Module]:
+        yield from (getattr(self, name) for name in self._extra_names)
 
     def head_parameters(self) -> Iterator[nn.Parameter]:
         """Decoders and heads: what the head learning-rate factor applies to."""
+        assert isinstance(self.net, Network)
         yield from self.net.decoders.parameters()
         yield from self.net.heads.parameters()
 
 
-def build_model(cell: config.Cell, labels: LabelSet) -> Model:
+def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
     """The cell's model with fresh (or, where the cell says so, pre-trained) weights.
 
     Raises:
@@ -131,17 +168,20 @@ def build_model(cell: config.Cell, labels: LabelSet) -> Model:
         )
     kind = plugins.load("backbones", cell.backbone)
     backbone = kind(strides=sizes.strides, pretrained=cell.pretrained, **cell.backbone_args)
-    net = Network(backbone, sizes, len(labels), cell.tasks)
-    pose = None
-    if "depth" in cell.tasks:
-        pose = PoseNetwork(
-            sizes.pose, sizes.pose_channels, sizes.pose_scale, cell.pretrained == "timm"
-        )
-    model = Model(net, pose)
+    model = Model(Network(backbone, sizes, tasks), tasks)
+    for task in tasks:
+        model.add_extra(task, task.extra(sizes, cell.pretrained == "timm"))
     for module in model.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = sizes.batch_norm_momentum
     return model
+
+
+def side_by_side(models: Iterable[Model]) -> Model:
+    """One model to evaluate and to time; it shares nothing and is not trained."""
+    models = list(models)
+    net = SideBySide(model.net for model in models)  # type: ignore[arg-type]
+    return Model(net, [task for model in models for task in model.tasks])
 
 
 def _resize(x_BCHW: Tensor, size: torch.Size) -> Tensor:

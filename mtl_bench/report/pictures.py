@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mtl_bench.data.labels import CITYSCAPES20, LabelSet
+from mtl_bench.core.labels import LabelSet
+from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.report.groups import SMOKE
 from mtl_bench.report.style import GRAY, save, styled
 from mtl_bench.report.tables import Table

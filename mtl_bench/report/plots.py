@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from mtl_bench.data.labels import CITYSCAPES20, LabelSet
+from mtl_bench.core.labels import LabelSet
+from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.report.columns import BY_NAME, Column
 from mtl_bench.report.groups import SMOKE, Group
 from mtl_bench.report.style import BASELINE, GRAY, MANY, Look, looks, save, styled

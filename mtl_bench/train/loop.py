@@ -2,8 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,15 +10,16 @@ import torch
 from torch import Tensor, nn
 
 from mtl_bench.core import plugins
+from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
+from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.device import Engine, initial_weights, seed_for
 from mtl_bench.core.method import Composed, LossMethod, Method
-from mtl_bench.core.terms import terms_of
-from mtl_bench.data.batch import Batch
-from mtl_bench.data.labels import LabelSet
-from mtl_bench.data.loader import open_dataset, train_batches
+from mtl_bench.core.task import Task, tasks_of, terms_of
+from mtl_bench.core.terms import Term
+from mtl_bench.data.loader import train_batches
+from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model, build_model
-from mtl_bench.tasks.losses import loss_terms
 from mtl_bench.train import checkpoint
 from mtl_bench.train.backward import Pass, Weighting, backward, losses_now
 from mtl_bench.train.curve import Curve
@@ -32,7 +32,6 @@ CHECKPOINT = "last.pt"
 
 def train(
     cell: Cell,
-    labels: LabelSet,
     root: Path,
     run_dir: Path,
     engine: Engine,
@@ -40,7 +39,7 @@ def train(
     tracker: Tracker,
     *,
     start: Path | None = None,
-    sequence_labels: Path | None = None,
+    further_labels: Path | None = None,
 ) -> Model:
     """Train a cell to its last step, from its own checkpoint where there is one.
 
@@ -49,14 +48,14 @@ def train(
         run_dir: where `last.pt` and `curve.csv` are kept.
         start: checkpoint whose model and method a fresh run goes on from; optimiser and learning
             rate begin anew.
-        sequence_labels: folder of labels of further frames to train on.
+        further_labels: folder of labels of further frames to train on.
 
     Raises:
         FloatingPointError: a loss term is NaN or infinite.
         Interrupted: a signal asked to stop; the state is saved.
     """
     optim = cell.recipe.optim
-    model, method, optimizer = build(cell, labels, engine)
+    model, method, optimizer = build(cell, engine)
     torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
     path, step = run_dir / CHECKPOINT, 0
     if path.is_file():
@@ -66,11 +65,14 @@ def train(
     elif start is not None:
         checkpoint.restore_weights(checkpoint.read(start), model, method)
 
-    dataset = open_dataset(cell, "train", root, training=True, sequence_labels=sequence_labels)
-    loss = replace(cell.recipe.loss, automask=cell.recipe.loss.automask or dataset.needs_automask)
+    samples = open_samples(
+        cell.recipe, model.tasks, "train", root, training=True, further_labels=further_labels
+    )
+    for task in model.tasks:
+        task.begin(samples.dataset)
     data_seed, first = seed_for(cell.seed, "data"), step * method.batches
     workers = cell.recipe.data.workers
-    batches = train_batches(dataset, optim.batch, data_seed, first, workers, engine.pinned)
+    batches = train_batches(samples, optim.batch, data_seed, first, workers, engine.pinned)
     clipped: list[Tensor] = list(model.parameters())
     model.train()
 
@@ -80,11 +82,8 @@ def train(
 
     def forward(part: Batch) -> Pass:
         with engine.autocast():
-            outputs = model.net(part.image_B3HW)
-            transforms = None
-            if model.pose is not None and part.context_BN3HW is not None:
-                transforms = model.pose(part.image_B3HW, part.context_BN3HW)
-        losses = loss_terms(part, outputs, transforms, loss, cell.tasks)
+            outputs = model(part)
+        losses = model.losses(outputs, part)
         check_finite(losses, step)
         return Pass(losses, outputs.representation)
 
@@ -114,7 +113,7 @@ def train(
                 method.after_step(weighting.loss_K, after_K)
             step += 1
 
-            row = describe_step(weighting, method, cell)
+            row = describe_step(weighting, method, model.tasks, bool(optim.cosine_every))
             row |= {"update_norm": update_norm, "grad_norm": grad_norm, "lr_factor": lr_factor}
             row["data_ms"] = data_ms  # the step's share that waited for its batches
             row["step_ms"] = 1000 * (time.perf_counter() - step_start)
@@ -128,16 +127,15 @@ def train(
     return model
 
 
-def build(
-    cell: Cell, labels: LabelSet, engine: Engine
-) -> tuple[Model, Method, torch.optim.Optimizer]:
+def build(cell: Cell, engine: Engine) -> tuple[Model, Method, torch.optim.Optimizer]:
     """Model, method and optimiser as they are before the first step."""
     optim = cell.recipe.optim
     if optim.batch < 2:
         raise ValueError("optim.batch must be at least 2: batch statistics of 1x1 maps need two")
+    tasks = tasks_of(cell.recipe, cell.tasks, dataset_of(cell.recipe).labels)
     with initial_weights(cell.seed):
-        model = build_model(cell, labels)
-    method = build_method(cell)
+        model = build_model(cell, tasks)
+    method = build_method(cell, terms_of(tasks, cell.granularity))
     engine.place(model)
     method.to(engine.device)
     heads = list(model.head_parameters())
@@ -155,13 +153,13 @@ def build(
     return model, method, torch.optim.Adam(groups, fused=True)
 
 
-def build_method(cell: Cell) -> Method:
-    """The cell's method over its losses; of `a+b`, the two composed.
+def build_method(cell: Cell, terms: Sequence[Term]) -> Method:
+    """The cell's method over these terms; of `a+b`, the two composed.
 
     Raises:
         ValueError: two parts that are not a loss-value method and then a gradient method.
     """
-    terms, seed = terms_of(cell.tasks, cell.granularity), seed_for(cell.seed, "method")
+    seed = seed_for(cell.seed, "method")
     names = plugins.part_names(cell.method)
     if len(names) == 1:
         return plugins.load("methods", cell.method)(terms, seed=seed, **cell.method_args)
@@ -207,16 +205,18 @@ def norm_of(parameters: Iterator[nn.Parameter]) -> float:
     return torch.nn.utils.get_total_norm(grads).item()
 
 
-def describe_step(weighting: Weighting, method: Method, cell: Cell) -> dict[str, float | None]:
+def describe_step(
+    weighting: Weighting, method: Method, tasks: Sequence[Task], cosines: bool
+) -> dict[str, float | None]:
     """What was minimised and how it was weighted; None for what this step does not have."""
     row: dict[str, float | None] = {"total": weighting.total}
-    for term in terms_of(cell.tasks):
+    for term in terms_of(tasks):
         row[f"loss.{term.name}"] = weighting.losses.get(term.name)
     names = [term.name for term in method.terms]
     for name in names:
         row[f"weight.{name}"] = weighting.weights.get(name)
     row["weight_sum"] = sum(weighting.weights.values())
-    if cell.recipe.optim.cosine_every:
+    if cosines:
         for first, second in itertools.combinations(names, 2):
             row[f"cosine.{first}.{second}"] = weighting.cosines.get(f"{first}.{second}")
     return row

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from mtl_bench.data.labels import LabelSet
+from mtl_bench.core.labels import LabelSet
 from mtl_bench.report.style import styled
 from mtl_bench.show import render
 from mtl_bench.show.figures.files import write_whole

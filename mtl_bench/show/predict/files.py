@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.data.labels import LabelSet
+from mtl_bench.core.labels import LabelSet
 from mtl_bench.show import render
 from mtl_bench.show.predict import Image, Predicted
 from mtl_bench.show.predict.point_cloud import from_prediction, write_npz, write_ply

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mtl_bench.data.labels import LabelSet
+from mtl_bench.core.labels import LabelSet
 from mtl_bench.show.predict import METRES, Predicted
 from mtl_bench.show.predict.point_cloud import from_prediction
 from mtl_bench.show.render import overlay

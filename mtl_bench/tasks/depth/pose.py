@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mtl_bench.core.backbone import Backbone, Normalize
+from mtl_bench.core.backbone import Backbone
 from mtl_bench.core.geometry import pose_from_vector
-from mtl_bench.model.layers import ConvNorm, init_fan_in
+from mtl_bench.model.layers import ConvNorm, Normalize, init_fan_in
 
 
 class PoseNetwork(nn.Module):

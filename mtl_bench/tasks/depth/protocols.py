@@ -8,18 +8,19 @@ images, and predictions are compared at the truth's own size, clamped to the ran
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mtl_bench.core import config
-from mtl_bench.data.layouts import CITYSCAPES, KITTI, LAYOUTS
+from mtl_bench.core.dataset import dataset_of
+from mtl_bench.core.plain import did_you_mean
+from mtl_bench.core.recipe import Recipe
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How depth is measured; `metrics.depth` reads the range and the crop."""
+    """How depth is measured; `metrics` reads the range and the crop."""
 
     name: str
     split: str
-    truth: str  # disparity | improved | velodyne, as `open_dataset` takes it
-    depth_crop: str  # a key of `metrics.depth.CROPS`
+    truth: str  # disparity | improved | velodyne, one of the data set's
+    depth_crop: str  # a key of `metrics.CROPS`
     scalings: tuple[str, ...]  # median looks at the truth, dgc at the camera's height
     frames_published: int  # of the split, as papers report it
     source: str
@@ -75,29 +76,28 @@ NAMED = {
         ),
     )
 }
-_LAYOUT_OF_TRUTH = {"disparity": CITYSCAPES, "improved": KITTI, "velodyne": KITTI}
 
 
-def named(name: str, dataset: str) -> Protocol:
+def named(name: str, recipe: Recipe) -> Protocol:
     """The protocol of that name.
 
     Raises:
-        ValueError: no such protocol, or one whose truth the data set's layout does not have.
+        ValueError: no such protocol, or one whose truth the recipe's data set does not have.
     """
     if name not in NAMED:
-        raise ValueError(f"no protocol called '{name}'{config.did_you_mean(name, NAMED)}")
-    layout = LAYOUTS.get(dataset)
-    if layout not in (None, _LAYOUT_OF_TRUTH[NAMED[name].truth]):
-        fitting = [p.name for p in NAMED.values() if _LAYOUT_OF_TRUTH[p.truth] == layout]
+        raise ValueError(f"no protocol called '{name}'{did_you_mean(name, NAMED)}")
+    has = dataset_of(recipe).truths
+    if has and NAMED[name].truth not in has:
+        fitting = [protocol.name for protocol in NAMED.values() if protocol.truth in has]
         raise ValueError(
-            f"protocol '{name}' needs {NAMED[name].truth} maps, which {dataset} lacks; set "
-            f"recipe.evaluate.protocol or also to one of {', '.join(fitting)}"
+            f"protocol '{name}' needs {NAMED[name].truth} maps, which {recipe.data.dataset} lacks; "
+            f"set recipe.evaluate.protocol or also to one of {', '.join(fitting)}"
         )
     return NAMED[name]
 
 
-def of_cell(cell: config.Cell, split: str | None = None) -> tuple[Protocol, ...]:
-    """The main protocol and, for a cell with the depth task, those that are measured also.
+def of_recipe(recipe: Recipe, split: str | None = None) -> tuple[Protocol, ...]:
+    """The main protocol and those that are measured also.
 
     The recipe's own split, range and crop stand in place of the main protocol's, which then says so
     in its title.
@@ -108,28 +108,20 @@ def of_cell(cell: config.Cell, split: str | None = None) -> tuple[Protocol, ...]
     Raises:
         ValueError: as `named`, or a protocol that is asked for twice.
     """
-    ev, dataset = cell.recipe.evaluate, cell.recipe.data.dataset
+    ev = recipe.evaluate
     if len({ev.protocol, *ev.also}) <= len(ev.also):
         raise ValueError(
             f"recipe.evaluate.also = {list(ev.also)} has a protocol twice, or the main one, "
             f"'{ev.protocol}'; name each once"
         )
-    main = named(ev.protocol, dataset)
+    main = named(ev.protocol, recipe)
+    others = [named(name, recipe) for name in ev.also]
     own = {"min_depth_m": ev.min_depth_m, "max_depth_m": ev.max_depth_m}
     crop = main.depth_crop if ev.depth_crop == "none" else ev.depth_crop
-    chosen = [_changed(main, split=split or ev.split, depth_crop=crop, **own)]
-    for name in ev.also if "depth" in cell.tasks else ():
-        other = named(name, dataset)
-        chosen.append(_changed(other, split=split or other.split))
-    return tuple(chosen)
-
-
-def passes(chosen: tuple[Protocol, ...]) -> list[list[Protocol]]:
-    """Protocols by the split and truth that they share, the main one's group first."""
-    groups: dict[tuple[str, str], list[Protocol]] = {}
-    for protocol in chosen:
-        groups.setdefault((protocol.split, protocol.truth), []).append(protocol)
-    return list(groups.values())
+    return (
+        _changed(main, split=split or ev.split, depth_crop=crop, **own),
+        *(_changed(other, split=split or other.split) for other in others),
+    )
 
 
 def _changed(protocol: Protocol, **values: Any) -> Protocol:

@@ -13,11 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtl_bench.core import config
-from mtl_bench.data.labels import IGNORE, LabelSet
+from mtl_bench.core.labels import (
+    DIVISOR,
+    IGNORE,
+    LARGEST_ID,
+    OUTSIDE,
+    LabelSet,
+    class_of_instance_id,
+)
 
-DIVISOR = 1000  # instance id = label id * 1000 + number; below it: a plain label id
-OUTSIDE = -1  # instance id of padding
-LARGEST_ID = 2**16 - 1  # the files are 16-bit
 _BYTE = 256  # values of one
 
 
@@ -117,10 +121,3 @@ def _heat_map(
 def _gaussian(reach: int, sigma: float) -> NDArray[np.float32]:
     square = np.arange(-reach, reach + 1) ** 2
     return np.exp(-(square[:, None] + square) / (2 * sigma**2)).astype(np.float32)
-
-
-@functools.cache
-def class_of_instance_id(labels: LabelSet) -> NDArray[np.uint8]:
-    """[65536] look-up table from a file's instance id to a class index or IGNORE."""
-    ids = np.arange(LARGEST_ID + 1)
-    return labels.class_of_label_id()[np.where(ids < DIVISOR, np.minimum(ids, 255), ids // DIVISOR)]

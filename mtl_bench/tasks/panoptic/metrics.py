@@ -1,11 +1,12 @@
-"""Panoptic quality by the official rules of Cityscapes and COCO (Kirillov et al., CVPR 2019).
+"""Panoptic quality and semantic IoU by the official rules of Cityscapes and COCO.
 
-A prediction and a true segment of one class match where their IoU exceeds one half. The union
-leaves out what of the prediction lies on void. An unmatched prediction that lies by more than half
-on void or on a crowd of its class is forgiven, as is every crowd. PQ is the sum of IoU over
-(TP + FP / 2 + FN / 2), averaged over the classes that occur. Equals cityscapesscripts' evaluator,
-with `ego vehicle` void in the truth and the prediction (MGNet's public code leaves its pixels in
-the truth, where they count against road and cars).
+Panoptic quality (Kirillov et al., CVPR 2019): a prediction and a true segment of one class match
+where their IoU exceeds one half. The union leaves out what of the prediction lies on void. An
+unmatched prediction that lies by more than half on void or on a crowd of its class is forgiven, as
+is every crowd. PQ is the sum of IoU over (TP + FP / 2 + FN / 2), averaged over the classes that
+occur. Equals cityscapesscripts' evaluator, with classes that are not evaluated void in the truth
+and the prediction (MGNet's public code leaves the ego vehicle's pixels in the truth, where they
+count against road and cars).
 
 Shapes: T true segments, P predicted ones, C classes.
 """
@@ -15,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.data.labels import IGNORE, LabelSet
-from mtl_bench.tasks.panoptic.targets import DIVISOR, class_of_instance_id
+from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet, class_of_instance_id
 
 VOID = -1  # category of pixels that count for nothing
 
@@ -152,3 +152,36 @@ class PanopticQuality:
             if present[i]
         }
         return result
+
+
+class SemanticIoU:
+    """IoU of a split, image by image, by Cityscapes' pixel-level rules. Results are in percent.
+
+    Pixels whose true class is not evaluated count for nothing; predicting such a class elsewhere is
+    a miss of the true one.
+    """
+
+    def __init__(self, labels: LabelSet) -> None:
+        self.labels = labels
+        self.confusion = np.zeros((IGNORE + 1, IGNORE + 1), np.int64)  # true, predicted
+
+    def update(self, predicted_class_HW: NDArray, true_class_HW: NDArray) -> None:
+        """Add an image: maps of class indices, IGNORE where there is none."""
+        pairs = true_class_HW.astype(np.int64) * (IGNORE + 1) + predicted_class_HW
+        self.confusion += np.bincount(pairs.ravel(), minlength=self.confusion.size).reshape(
+            self.confusion.shape
+        )
+
+    def compute(self) -> dict:
+        """miou, and the IoU per class; a class that occurs nowhere is in neither."""
+        evaluated = list(self.labels.evaluated)
+        true = self.confusion[evaluated]
+        tp = self.confusion[evaluated, evaluated]
+        union = true.sum(1) + true[:, evaluated].sum(0) - tp
+        per_class = {
+            self.labels.labels[index].name: {"iou": 100 * float(tp[row] / union[row])}
+            for row, index in enumerate(evaluated)
+            if union[row] > 0
+        }
+        ious = [values["iou"] for values in per_class.values()]
+        return {"miou": float(np.mean(ious)) if ious else float("nan"), "per_class": per_class}

@@ -11,79 +11,32 @@ KITTI: the split's frames, beside their images. No class there is the ego vehicl
 """
 
 import hashlib
-import os
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.core import config
+from mtl_bench.core.dataset import LabelGroup
+from mtl_bench.core.files import write_bytes
+from mtl_bench.core.labels import DIVISOR
+from mtl_bench.core.recipe import Recipe
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data import kitti_files, kitti_splits, png
 from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, Kind
-from mtl_bench.data.layouts import KITTI, layout_of
-from mtl_bench.tasks.panoptic.targets import DIVISOR
 
 LABEL_IDS = Kind("gtFine", "_gtFine_labelIds.png", "label map", 8)
-
-Size = tuple[int, int]  # height, width
-
-
-class Group(NamedTuple):
-    """Frames of one size, in order."""
-
-    names: list[str]
-    size: Size  # of the network's input at scale 1
-
-
-class Frames(Protocol):
-    """What the maker of labels needs to know of a data set."""
-
-    names: list[str]  # of the frames to label
-    out: Path  # where the record lies
-    folder: Path  # where the labels lie, for whoever reads them
-
-    def groups(self) -> Iterator[Group]: ...
-    def image(self, name: str) -> Path: ...
-    def done(self) -> set[str]:
-        """Names of the frames that are labelled."""
-        ...
-
-    def stranger(self) -> Path | None:
-        """A label file in `out`, where there is one."""
-        ...
-
-    def record(self) -> dict[str, Any]:
-        """What tells these labels from those of other frames or of another input."""
-        ...
-
-    def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None: ...
-
-
-def frames_of(root: Path, out: Path | None, split: str, recipe: config.Recipe) -> Frames:
-    """The frames of a split to label.
-
-    Args:
-        out: where labels go; None: beside KITTI's images.
-
-    Raises:
-        ValueError: no frame to label, or no place for labels.
-    """
-    if layout_of(root) == KITTI:
-        return KittiFrames(root, out or root, split, recipe)
-    if out is None:
-        raise ValueError("say where the labels go, --out DIR: a new or empty folder")
-    return CityscapesFrames(root, out, split, recipe)
 
 
 class CityscapesFrames:
     """Frames of `leftImg8bit_sequence` that have both neighbours and no human label."""
 
-    def __init__(self, root: Path, out: Path, split: str, recipe: config.Recipe) -> None:
+    def __init__(self, root: Path, out: Path | None, split: str, recipe: Recipe) -> None:
+        if out is None:
+            raise ValueError("say where the labels go, --out DIR: a new or empty folder")
         self.source, self.out = root / SEQUENCE.folder / split, out
         self.folder = out / LABELS.folder / split
         self.size = (recipe.data.height, recipe.data.width)
@@ -97,8 +50,8 @@ class CityscapesFrames:
         if self.folder.resolve().is_relative_to((root / LABELS.folder).resolve()):
             raise ValueError(f"{out}: the data set's own labels belong there; choose another --out")
 
-    def groups(self) -> Iterator[Group]:
-        yield Group(self.names, self.size)
+    def groups(self) -> Iterator[LabelGroup]:
+        yield LabelGroup(self.names, self.size)
 
     def image(self, name: str) -> Path:
         return files.file_of(self.source, SEQUENCE, name)
@@ -120,14 +73,14 @@ class CityscapesFrames:
     def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None:
         label_HW = np.where(ids_HW < DIVISOR, ids_HW, ids_HW // DIVISOR).astype(np.uint8)
         for kind, array in ((LABEL_IDS, label_HW), (LABELS, ids_HW)):
-            write(files.file_of(self.folder, kind, name), _encoded(array))
+            _write(files.file_of(self.folder, kind, name), array)
 
 
 class KittiFrames:
     """A split's frames that have an image, or all of the tree's; each day's at its own size."""
 
-    def __init__(self, root: Path, out: Path, split: str, recipe: config.Recipe) -> None:
-        self.out = self.folder = out
+    def __init__(self, root: Path, out: Path | None, split: str, recipe: Recipe) -> None:
+        self.out = self.folder = out = out or root
         self.stride = recipe.network.strides[-1]
         self.tree, self._labels = kitti_files.Tree(root), kitti_files.Tree(root, labels=out)
         if split == "all":
@@ -142,11 +95,11 @@ class KittiFrames:
         self._frames = {frame.name: frame for frame in frames}
         self.names = list(self._frames)
 
-    def groups(self) -> Iterator[Group]:
+    def groups(self) -> Iterator[LabelGroup]:
         for _, names in groupby(self.names, lambda name: name[:10]):
             day = list(names)
             header = png.read_header(self.image(day[0]))
-            yield Group(day, (self._divisible(header.height), self._divisible(header.width)))
+            yield LabelGroup(day, (self._divisible(header.height), self._divisible(header.width)))
 
     def _divisible(self, length: int) -> int:
         return max(round(length / self.stride), 1) * self.stride
@@ -165,19 +118,9 @@ class KittiFrames:
 
     def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None:
         ids_HW = np.where(ids_HW == files.EGO_ID, np.uint16(0), ids_HW)
-        write(self._labels.labels(self._frames[name]), _encoded(ids_HW))
+        _write(self._labels.labels(self._frames[name]), ids_HW)
 
 
-def _encoded(array_HW: NDArray) -> bytes:
-    return cv2.imencode(".png", array_HW)[1].tobytes()
-
-
-def write(path: Path, content: bytes) -> None:
-    """Whole or not at all."""
+def _write(path: Path, array_HW: NDArray[Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    write_bytes(path, cv2.imencode(".png", array_HW)[1].tobytes())

@@ -80,19 +80,30 @@ class DepthErrors:
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
-        self.errors: list[dict[str, float]] = []
-        self.without_truth = 0
+        self.sums = np.zeros(len(NAMES))
+        self.images = self.without_truth = 0
 
     def update(self, predicted_m_HW: NDArray, true_m_HW: NDArray) -> None:
         """Add an image; the prediction is in metres already."""
         mask_HW = evaluation_mask(true_m_HW, self.limits)
         if mask_HW.any():
-            self.errors.append(depth_errors(predicted_m_HW, true_m_HW, mask_HW, self.limits))
+            errors = depth_errors(predicted_m_HW, true_m_HW, mask_HW, self.limits)
+            self.sums += [errors[name] for name in NAMES]
+            self.images += 1
         else:
             self.without_truth += 1
 
+    def state(self) -> NDArray[np.float64]:
+        """Sums of the errors, then both counts of images."""
+        return np.array([*self.sums, self.images, self.without_truth])
+
+    def add(self, state: NDArray[np.float64]) -> None:
+        self.sums += state[: len(NAMES)]
+        self.images += int(state[-2])
+        self.without_truth += int(state[-1])
+
     def compute(self) -> dict[str, float]:
         """Every error's mean, and `images`, over how many; only that where there is none."""
-        count = len(self.errors)
-        means = {n: sum(e[n] for e in self.errors) / count for n in NAMES} if count else {}
-        return {**means, "images": count}
+        means = self.sums / max(self.images, 1)
+        found = dict(zip(NAMES, means.tolist(), strict=True)) if self.images else {}
+        return {**found, "images": self.images}

@@ -20,7 +20,7 @@ from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import eval_batches, open_dataset
 from mtl_bench.evaluate.walk import Progress, evaluating, predict, true_size
 from mtl_bench.model import Model
-from mtl_bench.tasks.panoptic.targets import DIVISOR
+from mtl_bench.core.labels import DIVISOR
 
 
 def export_predictions(

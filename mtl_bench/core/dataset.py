@@ -1,0 +1,205 @@
+"""What a data set is: frames with typed fields, cut into splits, read into samples.
+
+A data set is a file in `mtl_bench/data/` (or in `datasets/` of a plug-in folder) with one subclass
+of `Dataset`; its name is the file's stem. A subclass says which frames there are (`names`) and
+reads one (`read`). What is random about a training sample is no business of a data set:
+`data/samples.py` does it by the kind of each field.
+
+Shapes: N frames (a frame and its neighbours in time), H x W pixels.
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mtl_bench.core import plugins
+from mtl_bench.core.labels import LabelSet
+from mtl_bench.core.recipe import Data, Recipe
+
+
+class Kind(Enum):
+    """What a field is, which says how a flip, a resize and a crop act on it."""
+
+    IDS = "label map or instance ids [H,W]"  # nearest pixel; OUTSIDE on padding
+    DEPTH = "depth [H,W]"  # nearest pixel; a zoom divides it; 0 on padding
+    INVERSE_DEPTH = "inverse depth or disparity [H,W]"  # nearest pixel; a zoom multiplies it
+    NORMALS = "unit normals [3,H,W], x right, y down, z forward"  # nearest pixel; a flip negates x
+    MASK = "true or false [H,W]"  # nearest pixel; false on padding
+    VECTOR = "numbers of the whole image"  # nothing changes them
+
+
+NEIGHBOURS = "neighbours"  # what a task needs that compares a frame with those beside it in time
+
+
+@dataclass(frozen=True)
+class DecodedFrame:
+    """What is kept of a decoded frame; everything random comes later."""
+
+    images_N3HW: Sequence[Tensor]  # uint8, input size; in training followed by previous and next
+    K_33: Tensor | None = None
+    camera_height_m: float = 0.0
+    camera_pitch_rad: float = 0.0
+    # By name; at the input's size in training, at their own in evaluation
+    fields: Mapping[str, Tensor] = field(default_factory=dict)
+    static: Tensor | None = None  # ids [H,W] in training: tells what does not move with the scene
+
+
+class LabelGroup(NamedTuple):
+    """Frames of one size, in order."""
+
+    names: list[str]
+    size: tuple[int, int]  # height, width of the network's input at scale 1
+
+
+class LabelFrames(Protocol):
+    """Frames that get pseudo labels, and where those go."""
+
+    names: list[str]  # of the frames to label
+    out: Path  # where the record lies
+    folder: Path  # where the labels lie, for whoever reads them
+
+    def groups(self) -> Iterator[LabelGroup]: ...
+    def image(self, name: str) -> Path: ...
+    def done(self) -> set[str]:
+        """Names of the frames that are labelled."""
+        ...
+
+    def stranger(self) -> Path | None:
+        """A label file in `out`, where there is one."""
+        ...
+
+    def record(self) -> dict[str, Any]:
+        """What tells these labels from those of other frames or of another input."""
+        ...
+
+    def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None: ...
+
+
+class Dataset:
+    """Base of every data set: one split of it.
+
+    Args:
+        root: the folder that holds it.
+        split: train, val or test.
+        data: input size and whether decoded frames stay in memory.
+        needs: fields that tasks ask for, and NEIGHBOURS.
+        training: whether training samples are made of it, or the frames are only evaluated.
+        truth: one of `truths`, or "default".
+
+    Raises:
+        ValueError: no frames, or frames that lack a file, the first one named.
+    """
+
+    labels: ClassVar[LabelSet]
+    fields: ClassVar[Mapping[str, Kind]]
+    truths: ClassVar[tuple[str, ...]] = ()  # kinds of depth truth; empty: there is but one
+    static_ids: ClassVar[tuple[int, ...]] = ()  # instance ids that do not move with the scene
+    name: ClassVar[str] = ""  # the file's stem
+    takes_further_labels: ClassVar[bool] = False  # the video stage's; then it is a keyword argument
+    layout: ClassVar[str] = ""  # what its files look like, in a sentence
+    built_in: ClassVar[bool] = False  # rendered on first use; others need --data
+    published: ClassVar[Mapping[str, int]] = {}  # frames of each split, as papers report it
+    names: list[str]
+
+    def __init__(
+        self,
+        root: Path,
+        split: str,
+        data: Data,
+        *,
+        needs: Collection[str] = (),
+        training: bool = False,
+        truth: str = "default",
+    ) -> None:
+        self.root, self.split, self.data = root, split, data
+        self.needs, self.training, self.truth = frozenset(needs), training, truth
+        unknown = self.needs - {NEIGHBOURS} - self.fields.keys()
+        if unknown:
+            raise ValueError(
+                f"{data.dataset} has no {', '.join(sorted(unknown))}: it has "
+                f"{', '.join(sorted(self.fields))}"
+            )
+        if truth != "default" and self.truths and truth not in self.truths:
+            raise ValueError(
+                f"{data.dataset} has no depth truth '{truth}': it has {', '.join(self.truths)}"
+            )
+
+    # --- what a subclass says ---------------------------------------------------------------------
+
+    def read(self, name: str) -> DecodedFrame:
+        """Decode a frame: all at the input's size in training; truth at its own in evaluation."""
+        raise NotImplementedError
+
+    @classmethod
+    def recognises(cls, root: Path) -> bool:
+        """Whether a folder is in this data set's layout."""
+        raise NotImplementedError
+
+    @classmethod
+    def render(cls, data: Data, quiet: bool = False) -> Path:
+        """Of built-in data: the folder that it is in, rendered where it is not there yet."""
+        raise NotImplementedError
+
+    @classmethod
+    def check(cls, root: Path, deep: bool = False) -> tuple[list[str], int]:
+        """What a folder holds and lacks, line by line, and the number of problems."""
+        raise NotImplementedError
+
+    @classmethod
+    def image_files(cls, root: Path, split: str) -> dict[str, Path]:
+        """Names and image files of a split's frames, in order; no ground truth is needed."""
+        raise NotImplementedError
+
+    @classmethod
+    def frames_to_label(
+        cls, root: Path, out: Path | None, split: str, recipe: Recipe
+    ) -> LabelFrames:
+        """The frames of a split that get pseudo labels.
+
+        Args:
+            out: where labels go; None: beside the images.
+
+        Raises:
+            ValueError: no frame to label, or no place for labels.
+        """
+        raise ValueError(f"{cls.layout or cls.name} has no frames to label")
+
+    @property
+    def static_from(self) -> str:
+        """What the training frames' masks of static pixels come from."""
+        return "none"
+
+    @property
+    def knows_static(self) -> bool:
+        """Whether those masks leave out all that does not move with the scene."""
+        return False
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a row says of the training frames."""
+        return {}
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def dataset_of(recipe: Recipe) -> type[Dataset]:
+    """The data set that a recipe names.
+
+    Raises:
+        ValueError: no such data set.
+    """
+    found: type[Dataset] = plugins.load("datasets", recipe.data.dataset.replace("-", "_"))
+    return found
+
+
+def dataset_in(root: Path) -> type[Dataset] | None:
+    """The data set whose layout a folder has; built-in ones have that of another."""
+    kinds = (plugins.load("datasets", name) for name in plugins.files("datasets"))
+    return next((kind for kind in kinds if not kind.built_in and kind.recognises(root)), None)

@@ -1,0 +1,266 @@
+"""What a task is: its head, targets, loss terms, post-processing, metrics and picture.
+
+A task is a file in `mtl_bench/tasks/` (or in `tasks/` of a plug-in folder) with one subclass of
+`Task`. The network, the loop, the evaluation, the engines and the report know tasks by this
+contract alone; nothing else names one.
+
+Shapes: B images, H x W input pixels, h x w cells of the finest feature map.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mtl_bench.core import plugins
+from mtl_bench.core.batch import Batch, Camera
+from mtl_bench.core.columns import Column
+from mtl_bench.core.labels import LabelSet
+from mtl_bench.core.recipe import Network, Recipe
+from mtl_bench.core.terms import Term
+
+if TYPE_CHECKING:
+    from mtl_bench.core.dataset import Dataset
+
+Maps = dict[str, Tensor]  # by name, [B,C,H,W]
+Results = dict[str, Tensor]  # by name, the first axis is B
+Size = tuple[int, int]  # height, width
+Frame = Mapping[str, Any]  # one frame's arrays, by name
+
+
+class TaskHead(nn.Module):
+    """What a task adds to the network: decoders and heads, which are its own alone.
+
+    `decoders` and `heads` become the network's under the same names, which must be the task's.
+    """
+
+    decoders: nn.ModuleDict
+    heads: nn.ModuleDict
+
+    def forward(
+        self, pyramid: Sequence[Tensor], context_BC11: Tensor, auxiliary: bool = False
+    ) -> Maps:
+        """Features, finest first -> raw maps [B,C,h,w].
+
+        Args:
+            auxiliary: also those maps that only the losses read.
+        """
+        raise NotImplementedError
+
+
+class Metric:
+    """Adds up one task's results over the frames of a split."""
+
+    split: str = "val"
+    truth: str = "default"  # which of the data set's truths
+    reads_others: bool = True  # whether the result depends on the tasks in `after`
+    prefix: str = ""  # before its keys in a row: "" for the main one
+
+    def update(self, truth: Frame, result: Frame) -> Frame:
+        """Add a frame: arrays without the B axis, all of the truth's size.
+
+        Returns:
+            What a report may show of it: arrays [H,W,...]; and under the name of a column the
+            frame's own score, by which reports pick the worst and the best.
+        """
+        raise NotImplementedError
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What `compute` needs, as arrays that add up over ranks."""
+        raise NotImplementedError
+
+    def add(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Add another one's state."""
+        raise NotImplementedError
+
+    def compute(self) -> dict[str, float]:
+        """Flat, dotted keys of a row; what is undefined is absent."""
+        raise NotImplementedError
+
+    def record(self) -> dict[str, Any]:
+        """What a row keeps of how it was measured."""
+        return {}
+
+
+class Trivial:
+    """What a task's row must beat: a result made of the training split's truth alone."""
+
+    def add(self, truth: Frame) -> None:
+        """Learn from a frame's truth."""
+        raise NotImplementedError
+
+    def result(self, count: int, size: Size) -> Results:
+        """The same answer for so many frames, under the names that `Task.finish` gives."""
+        raise NotImplementedError
+
+    protocol: Mapping[str, Any] = {}
+
+
+class Task:
+    """Base of every task.
+
+    Args:
+        recipe: sizes, switches of losses, settings of the post-processing.
+        labels: the data set's classes.
+    """
+
+    name: ClassVar[str] = ""  # the file's stem
+    terms: ClassVar[tuple[Term, ...]]
+    kind: ClassVar[str] = "regression"  # the likelihood behind most of the sum of its terms
+    needs: ClassVar[frozenset[str]] = frozenset()  # fields of a training sample, beside the image
+    truth: ClassVar[frozenset[str]] = frozenset()  # fields of an evaluation sample
+    after: ClassVar[tuple[str, ...]] = ()  # tasks whose results `finish` may read
+    columns: ClassVar[tuple[Column, ...]] = ()  # of its metrics
+    categorical: ClassVar[frozenset[str]] = frozenset()  # maps of which `finish` reads the argmax
+    makes_labels: ClassVar[bool] = False  # whether the video stage's labels come from it
+    averages_flip: ClassVar[bool] = False  # whether `flip_averaged` does anything
+    # Which of a task's members make the numbers of each stage
+    stage_members: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "train": (
+            *("terms", "needs", "head", "activate", "extra", "training_maps", "targets"),
+            *("losses", "begin"),
+        ),
+        "evaluate": (
+            *("truth", "after", "head", "activate", "resized", "flip_averaged", "finish"),
+            *("metrics",),
+        ),
+        "time": ("after", "categorical", "head", "activate", "finish", "points"),
+    }
+
+    def __init__(self, recipe: Recipe, labels: LabelSet) -> None:
+        self.recipe, self.labels = recipe, labels
+
+    # --- network ----------------------------------------------------------------------------------
+
+    def head(self, inputs: tuple[int, ...], sizes: Network) -> TaskHead:
+        """Decoders and heads.
+
+        Args:
+            inputs: channels of the features, finest first.
+        """
+        raise NotImplementedError
+
+    def activate(self, maps: Maps) -> Maps:
+        """Raw maps -> maps in their own units, still [B,C,h,w]."""
+        return maps
+
+    def extra(self, sizes: Network, pretrained: bool) -> dict[str, nn.Module]:
+        """Networks that only training needs, by name."""
+        return {}
+
+    # --- training ---------------------------------------------------------------------------------
+
+    def begin(self, dataset: "Dataset") -> None:
+        """Learn what matters of the training data before the first step."""
+
+    def targets(self, sample: Batch) -> dict[str, Tensor]:
+        """Further fields of a training sample, made of those it has; called by loading workers."""
+        return {}
+
+    def training_maps(self, extra: Mapping[str, nn.Module], batch: Batch) -> Maps:
+        """What the networks of `extra` predict; runs under the training's precision."""
+        return {}
+
+    def losses(self, maps: Maps, batch: Batch) -> dict[str, Tensor]:
+        """Unweighted terms by name; one without labels in this batch is absent."""
+        raise NotImplementedError
+
+    def training_protocol(self, dataset: "Dataset") -> dict[str, Any]:
+        """What a row says of how the task was trained."""
+        return {}
+
+    # --- results ----------------------------------------------------------------------------------
+
+    def resized(self, maps: Maps, size: Size) -> Maps:
+        """Maps at another size: bilinear, corners not aligned."""
+        return {
+            name: F.interpolate(map_.float(), size, mode="bilinear", align_corners=False)
+            for name, map_ in maps.items()
+        }
+
+    def flip_averaged(self, maps: Maps, mirrored: Maps) -> Maps:
+        """Maps averaged with those of the mirrored image, where that means something."""
+        return maps
+
+    def finish(
+        self, maps: Maps, camera: Camera, done: Mapping[str, Results], size: Size | None = None
+    ) -> Results:
+        """Maps -> results: the only post-processing, of evaluation, prediction, timing and export.
+
+        Args:
+            maps: at the network's input size; a categorical one may be its argmax [B,H,W] instead.
+            camera: of the network's input.
+            done: results of the tasks in `after`, as far as they are there.
+            size: of the results; None: the maps' own.
+        """
+        raise NotImplementedError
+
+    def points(self, results: Mapping[str, Results], camera: Camera) -> Tensor | None:
+        """3D points [B,3,H,W] in the camera's frame, metres, NaN where there is none."""
+        return None
+
+    def metrics(self, split: str | None = None) -> list[Metric]:
+        """The main one first.
+
+        Args:
+            split: in place of the recipe's.
+        """
+        raise NotImplementedError
+
+    def protocol(self, tasks: Collection[str]) -> dict[str, Any]:
+        """What a row says of how results are made.
+
+        Args:
+            tasks: those that are evaluated together.
+        """
+        return {}
+
+    def trivial(self, size: Size) -> Trivial | None:
+        """The trivial predictor for frames of this size, where there is one."""
+        return None
+
+    def pictures(self, image_HW3: NDArray[np.uint8], frame: Frame) -> dict[str, NDArray[np.uint8]]:
+        """A heading -> RGB picture [H,W,3] of what `Metric.update` said of a frame."""
+        return {}
+
+
+def tasks_of(recipe: Recipe, names: Iterable[str], labels: LabelSet) -> tuple[Task, ...]:
+    """Tasks by name, each behind those whose results it reads, else in the order of their names.
+
+    Raises:
+        ValueError: an unknown task.
+    """
+    kinds: dict[str, type[Task]] = {n: plugins.load("tasks", n) for n in sorted(names)}
+    ordered: dict[str, Task] = {}
+    while len(ordered) < len(kinds):
+        for name, kind in kinds.items():
+            ready = ordered.keys() >= kinds.keys() & set(kind.after)
+            if name not in ordered and ready:
+                ordered[name] = kind(recipe, labels)
+                break
+        else:
+            raise ValueError(f"tasks wait for each other: {', '.join(kinds.keys() - ordered)}")
+    return tuple(ordered.values())
+
+
+def terms_of(tasks: Sequence[Task], granularity: str = "terms") -> tuple[Term, ...]:
+    """What a method weighs: the terms of these tasks, or the tasks as sums of them."""
+    if granularity == "tasks":
+        return tuple(Term(task.name, task.name, task.kind, 1.0, task.terms) for task in tasks)
+    return tuple(term for task in tasks for term in task.terms)
+
+
+def finish(
+    tasks: Iterable[Task],
+    maps: Mapping[str, Maps],
+    camera: Camera,
+    size: Size | None = None,
+) -> dict[str, Results]:
+    """Every task's results, by task, in the tasks' order."""
+    done: dict[str, Results] = {}
+    for task in tasks:
+        done[task.name] = task.finish(maps[task.name], camera, done, size)
+    return done

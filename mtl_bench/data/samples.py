@@ -1,0 +1,125 @@
+"""Samples: a data set's frames as the network and the tasks want them.
+
+In training a sample is an augmented frame, its neighbours in time where a task needs them, and what
+tasks make of its fields; in evaluation it is the plain frame with the truth at the frame's own size.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Self
+
+import torch
+from torch import Generator, Tensor
+
+from mtl_bench.core.batch import Batch, Camera
+from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, dataset_of
+from mtl_bench.core.labels import OUTSIDE
+from mtl_bench.core.recipe import Augment, Recipe
+from mtl_bench.core.task import Task
+from mtl_bench.data.augment import augment
+
+Targets = Callable[[Batch], dict[str, Tensor]]
+
+
+def open_samples(
+    recipe: Recipe,
+    tasks: Sequence[Task],
+    split: str,
+    root: Path,
+    training: bool,
+    further_labels: Path | None = None,
+    truth: str = "default",
+) -> "Samples":
+    """The split as a recipe and tasks want it.
+
+    Args:
+        further_labels: of the video stage, where the data set takes some.
+        truth: which of the data set's truths to evaluate on.
+
+    Raises:
+        ValueError: an unknown data set, or a folder that lacks what the tasks need.
+    """
+    needs = frozenset().union(*(task.needs if training else task.truth for task in tasks))
+    more = {} if further_labels is None else {"further_labels": further_labels}
+    dataset = dataset_of(recipe)(
+        root, split, recipe.data, needs=needs, training=training, truth=truth, **more
+    )
+    targets = [task.targets for task in tasks]
+    return Samples(dataset, recipe.augment if training else None, targets)
+
+
+class Samples:
+    """One split.
+
+    Args:
+        augment: random changes of training samples; None for evaluation samples.
+        targets: what makes further fields of a training sample.
+    """
+
+    def __init__(
+        self, dataset: Dataset, augment: Augment | None = None, targets: Sequence[Targets] = ()
+    ) -> None:
+        self.dataset, self.names = dataset, dataset.names
+        self._augment, self._targets = augment, tuple(targets)
+        self._kept: dict[int, DecodedFrame] | None = {} if dataset.data.cache else None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def uncached(self) -> Self:
+        """The same split, remembering nothing: for worker processes, which would each hold it."""
+        other = copy.copy(self)
+        other._kept = None
+        return other
+
+    def sample(self, index: int, generator: Generator | None) -> Batch:
+        """One sample, tensors without the B axis.
+
+        Args:
+            index: position in `names`.
+            generator: source of the augmentation; None for an evaluation sample.
+
+        Raises:
+            ValueError: a file of the frame is missing, damaged or does not fit the others.
+        """
+        name = self.names[index]
+        frame = self._kept.get(index) if self._kept is not None else None
+        if frame is None:
+            frame = self.dataset.read(name)
+            if self._kept is not None:
+                self._kept[index] = frame
+        if generator is not None:
+            return self._augmented(name, frame, generator)
+        image = frame.images_N3HW[0].contiguous().float() / 255
+        return Batch([name], image, _camera(frame, frame.K_33), dict(frame.fields))
+
+    def _augmented(self, name: str, frame: DecodedFrame, generator: Generator) -> Batch:
+        assert self._augment is not None
+        static = frame.static
+        if static is None:  # nothing is known of any pixel, but padding must be marked
+            static = torch.zeros(frame.images_N3HW[0].shape[-2:], dtype=torch.int32)
+        needs = self.dataset.needs
+        kinds = {key: kind for key, kind in self.dataset.fields.items() if key in frame.fields}
+        view = augment(
+            frame.images_N3HW, frame.K_33, static, frame.fields, kinds, self._augment, generator
+        )
+        sample = Batch([name], view.jittered_N3HW[0], _camera(frame, view.K_33), view.fields)
+        if NEIGHBOURS in needs:
+            unmoved = torch.tensor([*self.dataset.static_ids, OUTSIDE])
+            sample.fields |= {
+                "neighbours": view.jittered_N3HW[1:],  # jittered like the image
+                "clean": view.clean_N3HW[0],  # without jitter: what frames are compared by
+                "clean_neighbours": view.clean_N3HW[1:],
+                "reprojection_mask": ~torch.isin(view.static_HW, unmoved),
+            }
+        for make in self._targets:
+            sample.fields |= make(sample)
+        return sample
+
+
+def _camera(frame: DecodedFrame, K_33: Tensor | None) -> Camera | None:
+    if K_33 is None:
+        return None
+    height, pitch = frame.camera_height_m, frame.camera_pitch_rad
+    return Camera(K_33, torch.tensor(height), torch.tensor(pitch))

@@ -1,0 +1,19 @@
+"""The built-in scenes in Cityscapes' layout."""
+
+from pathlib import Path
+from typing import ClassVar
+
+from mtl_bench.core.recipe import Data
+from mtl_bench.data.cityscapes import Cityscapes
+
+
+class Synthetic(Cityscapes):
+    """Street scenes as videos, rendered on first use; what the numbers say is of them alone."""
+
+    built_in: ClassVar[bool] = True
+
+    @classmethod
+    def render(cls, data: Data, quiet: bool = False) -> Path:
+        from mtl_bench.data import scenes
+
+        return scenes.ensure(data, cls.layout, progress=not quiet)
