@@ -16,8 +16,8 @@ from mtl_bench.config import Data
 from mtl_bench.data import synthetic
 from mtl_bench.data.labels import CITYSCAPES20, KNOWN_LABEL_IDS
 from mtl_bench.data.synthetic import render
-from mtl_bench.data.synthetic.camera import BASELINE_M, context_from_target
-from mtl_bench.data.synthetic.files import encode_disparity
+from mtl_bench.data.synthetic.cityscapes import BASELINE_M, encode_disparity
+from mtl_bench.data.synthetic.rays import context_from_target
 
 HEIGHT, WIDTH = 64, 128
 

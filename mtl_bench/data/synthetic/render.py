@@ -10,28 +10,50 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.data.synthetic import shade, street, traffic
-from mtl_bench.data.synthetic.camera import (
+from mtl_bench.data.synthetic import street
+from mtl_bench.data.synthetic.rays import (
+    CYLINDER,
+    ELLIPSOID,
     Camera,
     FloatArray,
     Motion,
     Pose,
+    Solids,
+    cast,
     draw_camera,
     draw_motion,
-)
-from mtl_bench.data.synthetic.cast import cast
-from mtl_bench.data.synthetic.material import Markings
-from mtl_bench.data.synthetic.primitives import (
-    CYLINDER,
-    ELLIPSOID,
-    Solids,
     unit_frames,
     unit_normals,
+)
+from mtl_bench.data.synthetic.surfaces import (
+    ALONG,
+    FINE,
+    LOOKS,
+    NOISE,
+    Markings,
+    Material,
+    Patch,
+    fractal_noise,
+    lattice_noise,
 )
 
 RENDERER_VERSION = 6  # raised with every change of what is drawn
 EGO, SKY = 1, 23
 _DIVISOR = 1000
+
+
+@dataclass(frozen=True)
+class Light:
+    """One weather and time of day."""
+
+    sun_3: FloatArray  # unit vector towards the sun (y down)
+    sun_color_3: FloatArray
+    ambient_3: FloatArray
+    zenith_3: FloatArray  # sky colours
+    horizon_3: FloatArray
+    cloud: float  # 0..1
+    haze_m: float  # distance at which 1 - 1/e of the light comes from the air
+    seed: float
 
 
 @dataclass(frozen=True)
@@ -42,7 +64,7 @@ class Scene:
     solids: Solids
     markings: Markings
     shadows_S7: FloatArray
-    light: shade.Light
+    light: Light
     bonnet: tuple[float, float, float] | None  # edge, its drop to the sides (of H), shift (of W)
     bonnet_color_3: FloatArray
 
@@ -55,6 +77,13 @@ class Scene:
         """
         shared = frame + 3 - (frame - self.annotated + 3) % 7
         return self.motion.poses[min(max(shared, 0), len(self.motion.poses) - 1)]
+
+    def cast(
+        self, frame: int, u_W: FloatArray, v_H: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Depth and solid that the rays of these pixel columns and rows hit."""
+        pose, time = self.motion.poses[frame], frame - self.annotated
+        return cast(self.solids, self.camera, pose, time, u_W, v_H)
 
 
 @dataclass(frozen=True)
@@ -85,12 +114,10 @@ def draw_scene(
     on_roof = camera is not None
     camera = camera or draw_camera(rng, height, width)
     motion = draw_motion(np.random.default_rng([*seed, 1]), camera, frames, annotated)
-    light = shade.draw_light(rng)
+    light = _draw_light(rng)
     bonnet = (rng.uniform(0.9, 0.955), rng.uniform(0.02, 0.07), rng.uniform(-0.03, 0.03))
     color = np.float32(rng.uniform(0.05, 0.5)) + rng.normal(0, 0.05, 3).astype(np.float32)
-    place = street.plan(rng)
-    street.build_up(rng, place)
-    shadows = traffic.populate(rng, place, motion.step_m)
+    place, shadows = street.draw_street(rng, motion.step_m)
     return Scene(
         camera, motion, annotated, place.collector.solids(), place.markings,
         np.array(shadows, np.float32).reshape(-1, 7), light, None if on_roof else bonnet,
@@ -98,14 +125,40 @@ def draw_scene(
     )  # fmt: skip
 
 
+def _draw_light(rng: np.random.Generator) -> Light:
+    """Clear, overcast or late afternoon, with a sun that is never behind a wall of its own."""
+    azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.35, 1.1)
+    sun = [np.cos(height) * np.sin(azimuth), -np.sin(height), np.cos(height) * np.cos(azimuth)]
+    weather = rng.choice(3, p=[0.45, 0.35, 0.2])
+    strength = (rng.uniform(0.65, 0.85), rng.uniform(0.1, 0.25), rng.uniform(0.6, 0.75))[weather]
+    tint = ((1.0, 0.96, 0.88), (1.0, 1.0, 1.0), (1.0, 0.82, 0.6))[weather]
+    ambient = ((0.5, 0.54, 0.6), (0.76, 0.78, 0.8), (0.5, 0.48, 0.52))[weather]
+    zenith = ((0.3, 0.5, 0.85), (0.72, 0.75, 0.8), (0.45, 0.55, 0.8))[weather]
+    horizon = ((0.75, 0.85, 0.97), (0.86, 0.87, 0.88), (0.98, 0.86, 0.72))[weather]
+    exposure = rng.uniform(0.78, 1.12)
+    as_color = lambda c, k=1.0: np.array(c, np.float32) * np.float32(k)  # noqa: E731
+    return Light(
+        sun_3=as_color(sun),
+        sun_color_3=as_color(tint, strength * exposure),
+        ambient_3=as_color(ambient, exposure),
+        zenith_3=as_color(zenith, rng.uniform(0.85, 1.05)),
+        horizon_3=as_color(horizon, rng.uniform(0.9, 1.0)),
+        cloud=(rng.uniform(0, 0.8), rng.uniform(0.1, 0.4), rng.uniform(0.2, 0.8))[weather],
+        haze_m=rng.uniform(250, 900),
+        seed=rng.uniform(0, 30),
+    )
+
+
+# --- truth ----------------------------------------------------------------------------------------
+
+
 def truth(scene: Scene, frame: int) -> Truth:
     """Labels and depth of a frame from the rays through its pixel centres."""
-    camera, solids = scene.camera, scene.solids
-    time = frame - scene.annotated
-    u, v = _centres(camera)
-    depth, index = cast(solids, camera, scene.motion.poses[frame], time, u, v)
+    solids = scene.solids
+    u, v = _centres(scene.camera)
+    depth, index = scene.cast(frame, u, v)
     if scene.bonnet is not None:
-        index[_bonnet(scene.bonnet, camera, u, v) >= 0] = -2
+        index[_below_bonnet(scene.bonnet, scene.camera) >= 0] = -2
     label = solids.label_P[index].astype(np.uint8)
     label[index == -1], label[index == -2] = SKY, EGO
     things = np.where(index >= 0, solids.object_P[index], 0)
@@ -131,43 +184,38 @@ def instance_ids(seen: Truth, min_area: int) -> NDArray[np.uint16]:
     return ids
 
 
+# --- the image ------------------------------------------------------------------------------------
+
+
 def image(scene: Scene, frame: int) -> NDArray[np.uint8]:
     """Colour image [H,W,3] RGB."""
-    return (radiance(scene, frame) * 255 + 0.5).astype(np.uint8)
-
-
-def radiance(scene: Scene, frame: int) -> FloatArray:
-    """The image [H,W,3] before it is rounded to 8 bits: 0..1, display gamma."""
-    camera, pose = scene.camera, scene.motion.poses[frame]
+    camera = scene.camera
     height, width = camera.height, camera.width
-    time = frame - scene.annotated
     quarter = np.array([-0.25, 0.25], np.float32)
     u, v = _centres(camera)
     u2, v2 = (u[:, None] + quarter).ravel(), (v[:, None] + quarter).ravel()
-    depth, index = cast(scene.solids, camera, pose, time, u2, v2)
-    surface = index * 4 + _faces(scene, frame, u2, v2, index, depth)
-    blocks = surface.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
-    depths = depth.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
+    depth, index = scene.cast(frame, u2, v2)
+    faces = index * 4 + _faces(scene, frame, u2, v2, index, depth)
+    blocks, depths = (
+        x.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
+        for x in (faces, depth)
+    )
     mixed = (blocks != blocks[..., :1]).any(-1)
     with np.errstate(divide="ignore"):
         middle = 4 / (1 / depths).sum(-1)  # exact for planes: inverse depth is linear in the image
-    rows, cols = np.nonzero(~mixed)
     out = np.empty((height, width, 3), np.float32)
-    out[rows, cols] = _colors(
-        scene, frame, u[cols], v[rows], blocks[rows, cols, 0] >> 2, middle[rows, cols]
-    )
-    rows, cols = np.nonzero(mixed)
-    if len(rows):
-        du, dv = np.tile(quarter, 2), np.repeat(quarter, 2)
-        us, vs = (u[cols, None] + du).ravel(), (v[rows, None] + dv).ravel()
-        four = _colors(
-            scene, frame, us, vs, blocks[rows, cols].ravel() >> 2, depths[rows, cols].ravel()
-        )
-        out[rows, cols] = four.reshape(-1, 4, 3).mean(1)
+    i, j = np.nonzero(~mixed)
+    out[i, j] = _colors(scene, frame, u[j], v[i], blocks[i, j, 0] >> 2, middle[i, j])
+    i, j = np.nonzero(mixed)
+    if len(i):
+        us = (u[j, None] + np.tile(quarter, 2)).ravel()
+        vs = (v[i, None] + np.repeat(quarter, 2)).ravel()
+        four = _colors(scene, frame, us, vs, blocks[i, j].ravel() >> 2, depths[i, j].ravel())
+        out[i, j] = four.reshape(-1, 4, 3).mean(1)
     if scene.bonnet is not None:
-        _draw_bonnet(scene, out, _bonnet(scene.bonnet, camera, u, v))
-    toned: FloatArray = np.clip(out, 0, 1) ** np.float32(0.9)
-    return toned
+        _draw_bonnet(scene, out, _below_bonnet(scene.bonnet, camera))
+    toned = np.clip(out, 0, 1) ** np.float32(0.9)  # display gamma
+    return (toned * 255 + 0.5).astype(np.uint8)
 
 
 def _centres(camera: Camera) -> tuple[FloatArray, FloatArray]:
@@ -180,12 +228,9 @@ def _faces(
     """Which pair of faces of a box or cylinder a ray hits, 0..2; 0 for the round and the sky."""
     rows, cols = np.nonzero(index >= 0)
     hit = index[rows, cols]
-    camera = scene.camera
-    directions, origins = unit_frames(
-        scene.solids, scene.motion.poses[frame], frame - scene.annotated
-    )
-    x = ((u_W - camera.u0) / camera.fx).astype(np.float32)[cols]
-    y = ((v_H - camera.v0) / camera.fy).astype(np.float32)[rows]
+    pose, time = scene.motion.poses[frame], frame - scene.annotated
+    directions, origins = unit_frames(scene.solids, pose, time)
+    x, y = scene.camera.rays(u_W[cols], v_H[rows])
     t, m = depth[rows, cols], directions[hit]
     p = np.stack(
         [origins[hit, i] + (m[:, i, 0] * x + m[:, i, 1] * y + m[:, i, 2]) * t for i in range(3)], 1
@@ -209,36 +254,107 @@ def _colors(
     depth_N: FloatArray,
 ) -> FloatArray:
     """Colours [N,3] of what the rays through (u, v) see at a known depth."""
-    camera, pose = scene.camera, scene.motion.poses[frame]
-    time = frame - scene.annotated
-    x, y = (u_N - camera.u0) / camera.fx, (v_N - camera.v0) / camera.fy
-    ray_c = np.stack([x, y, np.ones_like(x)], 1).astype(np.float32)
+    pose, time = scene.motion.poses[frame], frame - scene.annotated
+    x, y = scene.camera.rays(u_N, v_N)
+    ray_c = np.stack([x, y, np.ones_like(x)], 1)
     ray = (pose.rotation_33.astype(np.float32)[None] * ray_c[:, None, :]).sum(2)
     out = np.empty((len(u_N), 3), np.float32)
     above = np.flatnonzero(index_N < 0)
-    out[above] = shade.sky(scene.light, ray[above])
+    out[above] = _sky(scene.light, ray[above])
     s = np.flatnonzero(index_N >= 0)
     index, depth = index_N[s], depth_N[s]
     directions, origins = unit_frames(scene.solids, pose, time)
     unit = origins[index] + (directions[index] * ray_c[s][:, None, :]).sum(2) * depth[:, None]
     world = pose.position_3.astype(np.float32) + ray[s] * depth[:, None]
-    shadows = scene.shadows_S7.copy()
-    shadows[:, :2] += shadows[:, 5:7] * time
-    flat = np.stack(
-        [*shadows[:, :2].T, np.cos(shadows[:, 2]), np.sin(shadows[:, 2]), *shadows[:, 3:5].T], 1
-    )
-    out[s] = shade.surface(
-        scene.solids, scene.light, scene.markings, flat, index, unit, world,
-        scene.viewer(frame), 1 / camera.fx,
-    )  # fmt: skip
+    out[s] = _surface(scene, frame, index, unit, world)
     return out
 
 
-def _bonnet(
-    bonnet: tuple[float, float, float], camera: Camera, u: FloatArray, v: FloatArray
+def _sky(light: Light, direction_N3: FloatArray) -> FloatArray:
+    """Colour of the sky along world directions: a gradient with soft clouds, nothing fine."""
+    d = direction_N3 / np.sqrt((direction_N3**2).sum(1, keepdims=True))
+    rise = np.clip(-d[:, 1] * 2.2, 0, 1)[:, None]
+    color = light.horizon_3 + (light.zenith_3 - light.horizon_3) * np.sqrt(rise)
+    flat = d / (np.abs(d[:, 1:2]) + 0.25) * np.float32(1.6) + np.float32(light.seed)
+    puffs = lattice_noise(flat) + 0.5 * lattice_noise(flat * 2.3)
+    share = np.clip(puffs * 0.9 + light.cloud - 0.35, 0, 1)[:, None] * np.sqrt(rise) * 0.8
+    white = np.array([0.95, 0.95, 0.96], np.float32) * light.horizon_3.max()
+    return color + (white - color) * share
+
+
+def _surface(
+    scene: Scene, frame: int, index_N: NDArray, unit_N3: FloatArray, world_N3: FloatArray
 ) -> FloatArray:
+    """Colours [N,3] of surface points given in unit and world space."""
+    solids, light, viewer = scene.solids, scene.light, scene.viewer(frame)
+    away = world_N3 - viewer.position_3.astype(np.float32)
+    ahead = (away * viewer.rotation_33[:, 2].astype(np.float32)).sum(1)
+    depth_N = np.maximum(ahead, np.float32(0.4))
+    face = unit_normals(solids.kind_P[index_N], unit_N3, solids.taper_P3[index_N])
+    half = solids.half_P3.astype(np.float32)[index_N]
+    local = face / half
+    turn = solids.rotation_P33.astype(np.float32)[index_N]
+    normal = (turn * local[:, None, :]).sum(2)
+    normal /= np.sqrt((normal * normal).sum(1, keepdims=True))
+    length = np.sqrt((away * away).sum(1))
+    facing = np.clip(-(normal * away).sum(1) / length, 0.02, 1)
+    footprint = depth_N * np.float32(1 / scene.camera.fx)
+    stretched = footprint / facing
+    p = unit_N3 * half
+    material = solids.material_P[index_N]
+    shift = (index_N.astype(np.float32) * np.float32(1.37))[:, None]
+    fixed = np.isin(material, (Material.ASPHALT, Material.PAVING, Material.GRASS))[:, None]
+    along = ALONG[material]
+    points = np.where(fixed, world_N3, p + shift)
+    points[:, 2] *= along
+    blur = FINE[material] * np.maximum(footprint, along * stretched)
+    noise = fractal_noise(points, NOISE[material], blur)
+    albedo = np.empty_like(p)
+    for m in np.unique(material):
+        s = np.flatnonzero(material == m)
+        look, solid = LOOKS[Material(m)], index_N[s]
+        albedo[s] = look.albedo(Patch(
+            p[s], half[s], face[s], world_N3[s], look.filter_px * footprint[s],
+            look.filter_px * stretched[s], solids.color_P3[solid], solids.color2_P3[solid],
+            solids.params_P4[solid], noise[s], scene.markings,
+        ))  # fmt: skip
+    albedo *= np.clip(1 + 0.75 * noise, 0.25, 1.9)[:, None]
+    shade = np.clip((normal * light.sun_3).sum(1), 0, 1)[:, None]
+    sky_share = 0.72 - 0.28 * normal[:, 1:2]  # surfaces that look up see more of the sky
+    contact = _contact(scene, frame, world_N3, footprint, stretched)[:, None]
+    color = albedo * (light.ambient_3 * sky_share + light.sun_color_3 * shade) * contact
+    air = 1 - np.exp(-depth_N / np.float32(light.haze_m))[:, None]
+    return color + (light.horizon_3 * 0.9 - color) * air
+
+
+def _contact(
+    scene: Scene, frame: int, world_N3: FloatArray, wide_N: FloatArray, long_N: FloatArray
+) -> FloatArray:
+    """Darkening of the ground under vehicles and people, 1 = none; soft, and softer than a pixel.
+
+    wide_N and long_N: metres that the pixel covers across and along the view.
+    """
+    dark = np.ones(len(world_N3), np.float32)
+    ground = np.flatnonzero(world_N3[:, 1] > -0.2)
+    x, z = world_N3[ground, 0], world_N3[ground, 2]
+    wide, long = 1.5 * wide_N[ground], 1.5 * long_N[ground]
+    factor = np.ones(len(ground), np.float32)
+    time = frame - scene.annotated
+    for x0, z0, yaw, hx, hz, vx, vz in scene.shadows_S7:
+        dx, dz, c, s = x - (x0 + vx * time), z - (z0 + vz * time), np.cos(yaw), np.sin(yaw)
+        blur_x, blur_z = 0.15 + abs(c) * wide + abs(s) * long, 0.15 + abs(s) * wide + abs(c) * long
+        a, b = (c * dx - s * dz) / (hx + blur_x), (s * dx + c * dz) / (hz + blur_z)
+        depth = hx * hz / ((hx + blur_x) * (hz + blur_z))
+        q = np.clip(1.25 - 0.6 * (a * a + b * b), 0, 1)
+        factor *= 1 - np.float32(0.75) * depth * q * q * (3 - 2 * q)
+    dark[ground] = np.maximum(factor, 0.25)
+    return dark
+
+
+def _below_bonnet(bonnet: tuple[float, float, float], camera: Camera) -> FloatArray:
     """How far [H,W] below the bonnet's edge a pixel centre lies, in pixels; in every frame."""
     top, drop, shift = bonnet
+    u, v = _centres(camera)
     across = (u / camera.width - 0.5 - shift) * 2
     return v[:, None] - (top + drop * across[None] ** 2) * camera.height
 
@@ -246,8 +362,7 @@ def _bonnet(
 def _draw_bonnet(scene: Scene, out: FloatArray, below: FloatArray) -> None:
     """Smooth paint that mirrors a little sky; its edge is anti-aliased, its mask is not."""
     share = np.clip(below + 0.5, 0, 1)[..., None]
-    gloss = np.exp(-np.maximum(below, 0) / (0.03 * scene.camera.height))[..., None] * np.float32(
-        0.35
-    )
-    color = scene.bonnet_color_3 * (scene.light.ambient_3 + 0.3) + gloss * scene.light.horizon_3
+    gloss = np.exp(-np.maximum(below, 0) / (0.03 * scene.camera.height))[..., None]
+    light, sheen = scene.light, gloss * np.float32(0.35)
+    color = scene.bonnet_color_3 * (light.ambient_3 + 0.3) + sheen * light.horizon_3
     out += (color - out) * share.astype(np.float32)
