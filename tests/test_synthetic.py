@@ -81,7 +81,8 @@ def warp_error(scene, frame, step):
     u_later, v_later = np.where(inside, u_later, 0), np.where(inside, v_later, 0)
     key, inner = interior(scene, frame, seen)
     key_later, inner_later = interior(scene, frame + step, seen_later)
-    static = inside & inner & (seen.depth_HW > 0) & ~seen.moving_HW
+    moving = np.abs(scene.solids.velocity_P3[seen.index_HW]).sum(-1) > 0  # or sky, without depth
+    static = inside & inner & (seen.depth_HW > 0) & ~moving
     u0, v0 = np.floor(u_later).astype(int), np.floor(v_later).astype(int)
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the same surface, not one that occludes it
         there = v0 + i, u0 + j

@@ -34,7 +34,7 @@ def read(path: Path, bits: int, color: bool = False) -> NDArray[Any]:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
     check_bits(path, _parse(path, data, data), bits)
     try:
-        PngImageFile(io.BytesIO(data)).verify()  # type: ignore[no-untyped-call]
+        PngImageFile(io.BytesIO(data)).verify()
     except Exception as error:  # Pillow's have no class in common
         raise ValueError(
             f"{path}: damaged PNG (checksum); copy or unpack the file again"

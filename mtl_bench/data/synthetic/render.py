@@ -6,6 +6,7 @@ box-filtered) texture where they see the same.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,6 @@ class Truth:
     label_HW: NDArray[np.uint8]
     object_HW: NDArray[np.int64]  # number of the thing, 0 = none
     depth_HW: FloatArray  # metres; 0 = sky or ego vehicle
-    moving_HW: NDArray[np.bool_]
 
 
 def draw_scene(
@@ -162,8 +162,7 @@ def truth(scene: Scene, frame: int) -> Truth:
     label = solids.label_P[index].astype(np.uint8)
     label[index == -1], label[index == -2] = SKY, EGO
     things = np.where(index >= 0, solids.object_P[index], 0)
-    moving = (index >= 0) & (np.abs(solids.velocity_P3[index]).sum(-1) > 0)
-    return Truth(index, label, things, np.where(index >= 0, depth, 0).astype(np.float32), moving)
+    return Truth(index, label, things, np.where(index >= 0, depth, 0).astype(np.float32))
 
 
 def instance_ids(seen: Truth, min_area: int) -> NDArray[np.uint16]:
@@ -189,21 +188,16 @@ def instance_ids(seen: Truth, min_area: int) -> NDArray[np.uint16]:
 
 def image(scene: Scene, frame: int) -> NDArray[np.uint8]:
     """Colour image [H,W,3] RGB."""
-    camera = scene.camera
-    height, width = camera.height, camera.width
     quarter = np.array([-0.25, 0.25], np.float32)
-    u, v = _centres(camera)
+    u, v = _centres(scene.camera)
     u2, v2 = (u[:, None] + quarter).ravel(), (v[:, None] + quarter).ravel()
     depth, index = scene.cast(frame, u2, v2)
     faces = index * 4 + _faces(scene, frame, u2, v2, index, depth)
-    blocks, depths = (
-        x.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
-        for x in (faces, depth)
-    )
+    blocks, depths = _blocks(faces), _blocks(depth)
     mixed = (blocks != blocks[..., :1]).any(-1)
     with np.errstate(divide="ignore"):
         middle = 4 / (1 / depths).sum(-1)  # exact for planes: inverse depth is linear in the image
-    out = np.empty((height, width, 3), np.float32)
+    out = np.empty((*mixed.shape, 3), np.float32)
     i, j = np.nonzero(~mixed)
     out[i, j] = _colors(scene, frame, u[j], v[i], blocks[i, j, 0] >> 2, middle[i, j])
     i, j = np.nonzero(mixed)
@@ -213,9 +207,15 @@ def image(scene: Scene, frame: int) -> NDArray[np.uint8]:
         four = _colors(scene, frame, us, vs, blocks[i, j].ravel() >> 2, depths[i, j].ravel())
         out[i, j] = four.reshape(-1, 4, 3).mean(1)
     if scene.bonnet is not None:
-        _draw_bonnet(scene, out, _below_bonnet(scene.bonnet, camera))
+        _draw_bonnet(scene, out, _below_bonnet(scene.bonnet, scene.camera))
     toned = np.clip(out, 0, 1) ** np.float32(0.9)  # display gamma
     return (toned * 255 + 0.5).astype(np.uint8)
+
+
+def _blocks(image: NDArray[Any]) -> NDArray[Any]:
+    """The 2x2 values of every pixel: [2 H,2 W] -> [H,W,4]."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    return image.reshape(height, 2, width, 2).transpose(0, 2, 1, 3).reshape(height, width, 4)
 
 
 def _centres(camera: Camera) -> tuple[FloatArray, FloatArray]:

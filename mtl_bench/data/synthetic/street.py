@@ -132,8 +132,8 @@ def _ground(rng: Random, street: Street) -> None:
     place([box((0, -1.03, 150), (600, 1, 700), grass, o.TERRAIN)], 0, 0)
     left, right = -street.left.kerb, street.right.kerb
     far = 400.0 if street.end_m is None else street.end_m + 12
-    at, size = ((left + right) / 2, -1, (far - 30) / 2), (right - left, 1, far + 30)
-    place([box(at, size, asphalt, o.ROAD)], 0, 0)
+    road = (right - left, 1, far + 30)
+    place([box(((left + right) / 2, -1, (far - 30) / 2), road, asphalt, o.ROAD)], 0, 0)
     roads = [] if street.crossing is None else [street.crossing]
     if street.end_m is not None:
         roads.append((street.end_m - 0.5, street.end_m + 8))
