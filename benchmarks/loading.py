@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from mtl_bench.core.config import Cell, load_recipe
-from mtl_bench.data import frame_cache, loader, synthetic
+from mtl_bench.data import frame_cache, loader, scenes as synthetic
 from mtl_bench.core.batch import Batch
 from mtl_bench.data.cityscapes import Cityscapes
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.device import Engine
 from mtl_bench.core.terms import Term, gather
-from mtl_bench.data import synthetic
+from mtl_bench.data import scenes as synthetic
 from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import open_dataset, train_batches

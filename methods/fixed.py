@@ -13,7 +13,8 @@ from torch import Tensor
 
 from mtl_bench.core.method import LossMethod
 from mtl_bench.core.plain import did_you_mean
-from mtl_bench.core.terms import TASK_KINDS, TERMS, Term
+from mtl_bench.core.task import loss_names
+from mtl_bench.core.terms import Term
 
 PRIORS = ("paper", "equal")
 
@@ -41,8 +42,8 @@ class Fixed(LossMethod):
         super().__init__(terms, seed)
         if prior not in PRIORS:
             raise ValueError(f"no prior called '{prior}'{did_you_mean(prior, PRIORS)}")
-        known = {*TASK_KINDS, *(term.name for term in (*TERMS, *terms))}
-        for name in weights:
+        for name in weights.keys() - {term.name for term in terms}:
+            known = loss_names()  # of another task: a cell's weights are those of its parts, too
             if name not in known:
                 raise ValueError(f"no loss called '{name}' to weigh{did_you_mean(name, known)}")
         start = {term.name: term.fixed_weight if prior == "paper" else 1.0 for term in terms}

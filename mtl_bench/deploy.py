@@ -11,9 +11,9 @@ from mtl_bench import latency
 from mtl_bench.bench import results
 from mtl_bench.bench.stored import load_model
 from mtl_bench.core import config
+from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Recipe, load_recipe
 from mtl_bench.core.device import Engine, initial_weights
-from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.engines.scene import Camera, Subject

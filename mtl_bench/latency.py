@@ -23,12 +23,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from mtl_bench.core import config, geometry
+from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.device import Engine
 from mtl_bench.core.provenance import cpu_model
-from mtl_bench.core.batch import Batch
-from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.core.task import Results, finish
 from mtl_bench.evaluate.walk import evaluating
-from mtl_bench.tasks.finish import Finish
+from mtl_bench.model import Model, Outputs
 
 STAGES = ("transfer", "network", "postprocess")
 MIB = 2**20
@@ -36,16 +36,12 @@ Stage = Callable[[Any], Any]
 
 
 def measure(
-    model: nn.Module,
+    model: Model,
     images: Iterable[Batch | Tensor],
-    K_33: Tensor,
-    camera_height_m: float,
-    things: tuple[int, ...],
-    evaluate: config.Evaluate,
+    camera: Camera,
     latency: config.Latency,
     device: torch.device | str,
     precision: str = "fp32",
-    road: int = CITYSCAPES20.index("road"),
 ) -> dict[str, float | int | str]:
     """Time `latency.passes` single images through `model.net` and what follows it.
 
@@ -53,11 +49,9 @@ def measure(
         model: on `device`; its `net` is timed in evaluation mode and left in the mode it was in.
         images: batches, or images [3,H,W] or [B,3,H,W], uint8 or float in [0, 1]. Each pass takes
             the next one; fewer images than passes are used in turn.
-        K_33: intrinsics in pixels of the images; with them and `camera_height_m` depth gets metres.
-        things: class indices whose pixels are grouped into instances.
+        camera: of the images, as a batch of one.
         latency: passes, warm-up, and the input size where it is not the images' own (bilinear
             resize before the clock starts, intrinsics scaled with it).
-        road: class index that the depth's scale is taken from.
 
     Returns:
         Values under `latency.`: mean_ms, std_ms, p50_ms, p95_ms, p99_ms, fps (1000 / mean), the
@@ -71,10 +65,10 @@ def measure(
         ValueError: no images or no passes.
     """
     engine = Engine(torch.device(device), precision)
-    hosts, K_133 = prepare(images, K_33, latency, pin=engine.device.type == "cuda")
+    hosts, K_133 = prepare(images, camera.K_B33[0], latency, pin=engine.device.type == "cuda")
     if latency.passes < 1:
         raise ValueError(f"latency.passes must be at least 1, not {latency.passes}")
-    stages = _stages(model, engine, K_133, camera_height_m, things, evaluate, road)
+    stages = _stages(model, engine, Camera(K_133, camera.height_m_B, camera.pitch_rad_B))
     with evaluating(model):
         cost = _cost(stages, hosts[0], engine.device)
         with torch.inference_mode():
@@ -126,19 +120,9 @@ def _single_images(images: Iterable[Batch | Tensor]) -> Iterator[Tensor]:
         yield from (image if image.dim() == 4 else image[None]).split(1)
 
 
-def _stages(
-    model: nn.Module,
-    engine: Engine,
-    K_133: Tensor,
-    camera_height_m: float,
-    things: tuple[int, ...],
-    evaluate: config.Evaluate,
-    road: int,
-) -> list[Stage]:
+def _stages(model: Model, engine: Engine, camera: Camera) -> list[Stage]:
     """The three timed functions, each fed with the one before's result."""
-    K_133 = K_133.to(engine.device)
-    height_m_1 = torch.tensor([camera_height_m], device=engine.device)
-    finish = Finish(things, road, evaluate)
+    camera = camera.map(lambda value: value.to(engine.device))
     layout = torch.channels_last if engine.channels_last else torch.contiguous_format
 
     def transfer(host: Tensor) -> Tensor:
@@ -147,14 +131,10 @@ def _stages(
 
     def network(image_13HW: Tensor) -> Any:
         with engine.autocast():
-            return model.net(image_13HW)  # type: ignore[operator]
+            return model.net(image_13HW)
 
-    def last(out: Any) -> dict[str, Tensor]:
-        inverse = out.inverse_depth[0] if out.inverse_depth else None
-        found: dict[str, Tensor] = finish(
-            out.semantic_BCHW, out.center_B1HW, out.offset_B2HW, inverse, K_133, height_m_1
-        )
-        return found
+    def last(out: Outputs) -> dict[str, Results]:
+        return finish(model.tasks, out.maps, camera)
 
     return [transfer, network, last]
 

@@ -33,7 +33,7 @@ def as_at_the_start():
 @pytest.fixture(scope="session")
 def smoke_root(tmp_path_factory) -> Path:
     """The smoke recipe's data set, rendered once."""
-    from mtl_bench.data import synthetic
+    from mtl_bench.data import scenes as synthetic
 
     return synthetic.ensure(
         load_recipe("smoke").data, tmp_path_factory.mktemp("data") / "smoke", progress=False

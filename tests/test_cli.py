@@ -34,7 +34,7 @@ def isolated(tmp_path, monkeypatch):
     """An empty working directory, and no plug-in folders but the package's own."""
     monkeypatch.setenv(plugins.VARIABLE, "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("mtl_bench.data.synthetic.render_all", refuse_to_render)
+    monkeypatch.setattr("mtl_bench.data.scenes.make.render_all", refuse_to_render)
     monkeypatch.chdir(tmp_path)
 
 

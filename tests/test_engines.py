@@ -399,7 +399,7 @@ def test_trained_weights_over_the_val_split(name):
     if not found:
         pytest.skip("no trained run in runs/")
     from mtl_bench import deploy
-    from mtl_bench.data import synthetic
+    from mtl_bench.data import scenes as synthetic
 
     cell, trained = deploy.from_checkpoint(found[0], None)
     what = deploy.subject(

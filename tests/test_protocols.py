@@ -10,7 +10,7 @@ from torch import nn
 
 from mtl_bench.core import config
 from mtl_bench.core.config import Cell, load_recipe
-from mtl_bench.data import synthetic
+from mtl_bench.data import scenes as synthetic
 from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES19
 from mtl_bench.data.layouts import KITTI

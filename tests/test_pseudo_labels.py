@@ -19,12 +19,12 @@ from mtl_bench.bench import results
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Augment, Cell, Data, Evaluate, Loss, Network, PseudoLabels, Recipe
 from mtl_bench.core.plain import to_dict
-from mtl_bench.data import synthetic
+from mtl_bench.data import scenes as synthetic
 from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, file_of, names_in, read_instance_ids
 from mtl_bench.core.labels import IGNORE
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import open_dataset
-from mtl_bench.data.synthetic import render
+from mtl_bench.data.scenes import render
 from mtl_bench.evaluate import pseudo_frames, pseudo_labels
 from mtl_bench.evaluate.pseudo_labels import RECORD, average, ensure, pass_sizes
 from mtl_bench.model import Outputs, build_model

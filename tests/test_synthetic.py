@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from mtl_bench.core.config import Data
-from mtl_bench.data import synthetic
+from mtl_bench.data import scenes as synthetic
 from mtl_bench.data.labels import CITYSCAPES20, KNOWN_LABEL_IDS
-from mtl_bench.data.synthetic import render
-from mtl_bench.data.synthetic.camera import BASELINE_M, context_from_target
-from mtl_bench.data.synthetic.files import encode_disparity
+from mtl_bench.data.scenes import render
+from mtl_bench.data.scenes.cityscapes import BASELINE_M, encode_disparity
+from mtl_bench.data.scenes.rays import context_from_target
 
 HEIGHT, WIDTH = 64, 128
 
@@ -81,7 +81,8 @@ def warp_error(scene, frame, step):
     u_later, v_later = np.where(inside, u_later, 0), np.where(inside, v_later, 0)
     key, inner = interior(scene, frame, seen)
     key_later, inner_later = interior(scene, frame + step, seen_later)
-    static = inside & inner & (seen.depth_HW > 0) & ~seen.moving_HW
+    moving = np.abs(scene.solids.velocity_P3[seen.index_HW]).sum(-1) > 0  # or sky, without depth
+    static = inside & inner & (seen.depth_HW > 0) & ~moving
     u0, v0 = np.floor(u_later).astype(int), np.floor(v_later).astype(int)
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the same surface, not one that occludes it
         there = v0 + i, u0 + j
@@ -257,7 +258,7 @@ def test_a_recipe_chooses_the_length_of_the_snippets(tmp_path):
 def test_a_killed_run_leaves_no_data_set(tmp_path):
     out = tmp_path / "set"
     code = (
-        "import pathlib, sys; from mtl_bench.data import synthetic;"
+        "import pathlib, sys; from mtl_bench.data import scenes as synthetic;"
         "synthetic.write(pathlib.Path(sys.argv[1]), 32, 64, 500, 1, 0, progress=False)"
     )
     child = subprocess.Popen([sys.executable, "-c", code, str(out)])

@@ -10,12 +10,13 @@ import pytest
 from test_synthetic import digests, read, warp_error
 
 from mtl_bench.core.config import Cell, Data, load_recipe
-from mtl_bench.data import kitti_files, synthetic, velodyne
+from mtl_bench.data import kitti_files, scenes as synthetic, velodyne
 from mtl_bench.data.labels import CITYSCAPES19
 from mtl_bench.data.layouts import KITTI, layout_of
 from mtl_bench.data.loader import open_dataset
-from mtl_bench.data.synthetic import kitti_layout, lidar, render
-from mtl_bench.data.synthetic.settings import SPLITS, Settings
+from mtl_bench.data.scenes import kitti as kitti_layout
+from mtl_bench.data.scenes import render
+from mtl_bench.data.scenes.settings import SPLITS, Settings
 
 HEIGHT, WIDTH, FRAMES, SEED = 48, 144, 4, 3
 SETTINGS = Settings(HEIGHT, WIDTH, 5, 2, 17, SEED, FRAMES, FRAMES // 2, 10, layout=KITTI)
@@ -125,7 +126,7 @@ def test_the_ground_is_a_camera_height_below(root):
         heights.append(np.median((rows - camera.K_33[1, 2]) / camera.K_33[1, 1] * improved[road]))
         scan = velodyne.read_scan(drive / "velodyne_points/data/0000000002.bin")
         low = scan[(scan[:, 2] < -1.6) & (scan[:, 0] < 12)]
-        assert np.median(-low[:, 2]) == pytest.approx(1.65 + lidar.ABOVE_M, abs=0.02)
+        assert np.median(-low[:, 2]) == pytest.approx(1.65 + kitti_layout.ABOVE_M, abs=0.02)
     assert heights == pytest.approx([kitti_files.CAMERA_HEIGHT_M] * 4, abs=0.02)
 
 
@@ -207,7 +208,7 @@ def test_a_full_size_scan_is_as_sparse_as_kittis():
     camera = kitti_layout.camera_of(settings, kitti_layout.DATES[0])
     scene = render.draw_scene((SEED, 0, 0), 375, 1242, 3, 1, camera)
     depth = render.truth(scene, 1).depth_HW
-    points = lidar.scan(depth, camera, np.zeros_like(depth))
+    points = kitti_layout.scan(depth, camera, np.zeros_like(depth))
     assert points.dtype == np.float32
     assert 0.02 < len(points) / depth.size < 0.06
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))

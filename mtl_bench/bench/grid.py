@@ -46,7 +46,7 @@ from typing import Any
 
 from mtl_bench.bench import grid_file
 from mtl_bench.bench.grid_file import GRIDS, grid_names, question_of
-from mtl_bench.core.config import TASKS, Cell, Recipe, load_recipe, override, set_values, to_dict
+from mtl_bench.core.config import Cell, Recipe, load_recipe, override, set_values, to_dict
 from mtl_bench.core.toml_file import Place, TomlFile
 
 __all__ = ["GRIDS", "Grid", "Skip", "baseline_cell", "grid_names", "load_grid", "question_of"]
@@ -89,7 +89,12 @@ def with_parents(cells: Iterable[Cell]) -> tuple[Cell, ...]:
 def baseline_cell(cell: Cell, settings: Mapping[str, Any]) -> Cell:
     """What a cell's delta is against: its recipe, backbone and seed under a grid's [baseline]."""
     plain = replace(
-        cell, tasks=TASKS, video=False, single_task=False, granularity="terms", method_args=NOTHING
+        cell,
+        tasks=cell.recipe.tasks,
+        video=False,
+        single_task=False,
+        granularity="terms",
+        method_args=NOTHING,
     )
     return set_values(plain, settings)
 
@@ -214,7 +219,7 @@ def _cell(
     recipe = values.pop("recipe", None)
     if recipe is not None:
         try:
-            start = replace(start, recipe=load_recipe(str(recipe)))
+            start = replace(start, recipe=load_recipe(str(recipe)), tasks=())
         except ValueError as error:
             raise file.error(str(error), "recipe", *places) from error
     factors = {k: v for k, v in values.items() if isinstance(v, str) and TIMES.fullmatch(v)}

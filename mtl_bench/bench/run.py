@@ -16,12 +16,11 @@ from mtl_bench.bench import results
 from mtl_bench.bench.stored import load_model, time_cell
 from mtl_bench.core import provenance
 from mtl_bench.core.config import Cell, to_dict
+from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.device import Engine, choose_device
-from mtl_bench.data.kitti import Kitti
-from mtl_bench.data.labels import labels_of
-from mtl_bench.data.loader import open_dataset
-from mtl_bench.evaluate import pseudo_labels
-from mtl_bench.evaluate.walk import evaluate, open_passes
+from mtl_bench.core.task import tasks_of_cell
+from mtl_bench.data.samples import open_samples
+from mtl_bench.evaluate.walk import evaluate, evaluating, open_walks
 from mtl_bench.model import Model
 from mtl_bench.train.curve import data_share, training_time
 from mtl_bench.train.loop import CHECKPOINT, train
@@ -69,7 +68,10 @@ def run_cell(
     environment = provenance.environment(engine.device)
     results.write_json(run_dir / "env.json", environment)
 
-    open_passes(cell, root)  # what would stop the evaluation is told before the training
+    tasks = tasks_of_cell(cell)
+    open_walks(
+        cell.recipe, tasks, root
+    )  # what would stop the evaluation is told before the training
     if cell.single_task:
         trained = _trained_apart(cell, run_dir, engine)
     else:
@@ -111,19 +113,16 @@ def _train(
 ) -> Trained:
     """Train; a video cell goes on from its parent's checkpoint, with labels that this one made."""
     taken: dict[str, Any] = results.read_json(run_dir / TAKEN) or {}
-    start = sequence_labels = None
+    start = further_labels = None
     protocol = {}
     if cell.video:
         _, start = _result_of(cell.parents[0], run_dir.parent)
-        sequence_labels, frames = _pseudo_labels(
-            cell, start, root, run_dir, engine, progress, taken
-        )
+        further_labels, frames = _pseudo_labels(cell, start, root, run_dir, engine, progress, taken)
         protocol = {"pseudo_frames": frames}
     if engine.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(engine.device)
-    labels = labels_of(cell.recipe.data.dataset)
-    given = (cell, labels, root, run_dir, engine, progress, tracker)
-    model = train(*given, start=start, sequence_labels=sequence_labels)
+    given = (cell, root, run_dir, engine, progress, tracker)
+    model = train(*given, start=start, further_labels=further_labels)
     taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(engine.device))
     results.write_json(run_dir / TAKEN, taken)
     train_s, step_ms = training_time(run_dir / "curve.csv")
@@ -151,8 +150,11 @@ def _pseudo_labels(
             raise Interrupted(f"stopped at pseudo label {done} of {of}, kept in {run_dir}")
 
     began = time.perf_counter()
-    out = run_dir / "pseudo_labels"
-    folder = pseudo_labels.ensure(model, cell, root, out, engine.device, note)
+    kind = dataset_of(cell.recipe)
+    frames = kind.frames_to_label(root, run_dir / "pseudo_labels", "train", cell.recipe)
+    task = next(task for task in model.tasks if task.makes_labels)
+    with evaluating(model):
+        folder = task.label(model, frames, engine.device, note)
     made = counts[-1] - counts[0]
     if made:  # a run that was killed here made the others, as fast
         taken["pseudo_s"] = (time.perf_counter() - began) * counts[-1] / made
@@ -193,13 +195,12 @@ def _peak_mib(device: torch.device) -> float:
 
 
 def _training_protocol(cell: Cell, root: Path) -> dict[str, Any]:
-    """What kept the sky and the ego vehicle out of the photometric loss; KITTI's frames."""
-    dataset = open_dataset(cell, "train", root, training=True)
-    protocol: dict[str, Any] = {}
-    if isinstance(dataset, Kitti):
-        protocol["training"] = dataset.described
-    if "depth" in cell.tasks:
-        protocol["reprojection_mask"] = dataset.reprojection_mask
+    """What the data set and the tasks say of the training frames."""
+    tasks = tasks_of_cell(cell)
+    dataset = open_samples(cell.recipe, tasks, "train", root, training=True).dataset
+    protocol: dict[str, Any] = {"training": dataset.described} if dataset.described else {}
+    for task in tasks:
+        protocol |= task.training_protocol(dataset)
     return protocol
 
 

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,14 @@ import torch
 
 from mtl_bench.bench import results
 from mtl_bench.core import provenance
+from mtl_bench.core.batch import collate
 from mtl_bench.core.config import Cell
 from mtl_bench.core.device import Engine, choose_device
 from mtl_bench.core.quiet import SIDE_BY_SIDE, Quiet
-from mtl_bench.data.labels import labels_of
-from mtl_bench.data.loader import open_dataset
-from mtl_bench.evaluate.export_predictions import export_predictions
-from mtl_bench.evaluate.walk import Evaluation, evaluate
+from mtl_bench.core.task import Results
+from mtl_bench.data.loader import eval_batches
+from mtl_bench.data.samples import open_samples
+from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, predict, true_size
 from mtl_bench.latency import measure
 from mtl_bench.model import Model, side_by_side
 from mtl_bench.train import checkpoint
@@ -45,6 +46,29 @@ def reevaluate(
     return evaluate(model, cell, root, engine.device, split)
 
 
+def export_predictions(
+    model: Model, cell: Cell, root: Path, out: Path, device: torch.device, split: str | None = None
+) -> None:
+    """Predict a split (None: the recipe's) and write it as official evaluators read it.
+
+    Raises:
+        ValueError: no task of the cell has such files.
+    """
+    split = split or cell.recipe.evaluate.split
+    samples = open_samples(cell.recipe, model.tasks, split, root, training=False)
+
+    def frames(name: str) -> Iterator[tuple[str, Results]]:
+        for batch in eval_batches(samples, 8):
+            found = predict(model, batch.to(device), model.tasks, true_size(batch))[name]
+            for slot, frame in enumerate(batch.names):
+                yield frame, {key: value[slot].cpu() for key, value in found.items()}
+
+    with evaluating(model), torch.inference_mode():
+        written = [task.write_results(out, split, frames(task.name)) for task in model.tasks]
+    if not any(written):
+        raise ValueError(f"no task of cell {cell.slug} has results to export")
+
+
 def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
     """A cell's model with the weights of a checkpoint.
 
@@ -60,7 +84,7 @@ def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
         pairs = zip(cell.parents, paths, strict=True)
         return side_by_side([load_model(parent, file, engine) for parent, file in pairs])
     state = checkpoint.read(path)
-    model = build(cell, labels_of(cell.recipe.data.dataset), engine)[0]
+    model = build(cell, engine)[0]
     try:
         model.load_state_dict(state["model"])
     except RuntimeError as error:
@@ -78,9 +102,10 @@ def time_cell(
     those hold still meanwhile.
     """
     recipe = cell.recipe
-    dataset = open_dataset(cell, recipe.evaluate.split, root, training=False)
-    first = dataset.sample(0, None)
-    frames = (dataset.sample(index, None) for index in range(min(len(dataset), FRAMES)))
+    samples = open_samples(recipe, model.tasks, recipe.evaluate.split, root, training=False)
+    frames = [samples.sample(index, None) for index in range(min(len(samples), FRAMES))]
+    camera = collate(frames[:1]).camera
+    assert camera is not None
     images = [(frame.image_B3HW * 255).round().to(torch.uint8) for frame in frames]
     threads = torch.get_num_threads()
     with quiet.alone(neighbours=SIDE_BY_SIDE in os.environ):
@@ -89,10 +114,7 @@ def time_cell(
         timing = measure(
             model,
             images,
-            first.K_B33,
-            float(first.camera_height_m_B),
-            labels_of(recipe.data.dataset).things,
-            recipe.evaluate,
+            camera,
             recipe.latency,
             engine.device,
             engine.precision,

@@ -12,7 +12,7 @@ from typing import Any
 from mtl_bench import engines
 from mtl_bench.bench import results
 from mtl_bench.core import plugins
-from mtl_bench.core.config import TASKS, Recipe, load_recipe
+from mtl_bench.core.config import Recipe, load_recipe
 from mtl_bench.core.plain import did_you_mean, to_dict
 
 PROTOCOL = 1  # raised when times taken before stop being comparable with times taken after
@@ -32,7 +32,7 @@ class Timing:
     engine: str
     precision: str = "fp32"
     size: str = "1024x2048"  # height x width of the image, pixels
-    tasks: tuple[str, ...] = TASKS
+    tasks: tuple[str, ...] = Recipe.tasks
     device: str = "cpu"  # cpu | cuda: the kind; its name stands in the row
     passes: int = 500  # the paper's
     seconds: float | None = None  # ends the passes early, as `mtl-bench latency --seconds` does
@@ -103,8 +103,7 @@ def check(timings: Iterable[Timing]) -> None:
             hint = did_you_mean(timing.engine, engines.NAMES)
             raise ValueError(f"no engine called '{timing.engine}'{hint}")
         for task in timing.tasks:
-            if task not in TASKS:
-                raise ValueError(f"no task called '{task}'{did_you_mean(task, TASKS)}")
+            plugins.path_of("tasks", task)
         plugins.path_of("backbones", timing.backbone)
         settings = plugins.settings("backbones", timing.backbone) if timing.backbone_args else {}
         for key in timing.backbone_args.keys() - settings.keys():

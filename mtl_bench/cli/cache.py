@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mtl_bench.cli import options as o
-from mtl_bench.core.config import TASKS, Cell, load_recipe
+from mtl_bench.core.config import Cell, load_recipe
 
 if TYPE_CHECKING:
     from mtl_bench.data.frame_cache import FrameCache, Source
@@ -28,17 +28,18 @@ def cache(
         ),
     ] = None,
     tasks: Annotated[
-        str, typer.Option(help="Whose files, separated by commas; depth alone needs no labels.")
-    ] = ",".join(TASKS),
+        str | None,
+        typer.Option(
+            help="Whose files, separated by commas; some need no labels. Without it the recipe's.",
+            show_default=False,
+        ),
+    ] = None,
     quiet: o.QuietOption = False,
 ) -> None:
     """Write down the decoded and shrunk frames of a recipe's training and evaluation splits, so
     that training need not wait for its images. Says first what that takes; goes on where it was
     stopped, and decodes again what has changed. Results are the same with and without."""
-    names = tuple(word.strip() for word in tasks.split(",") if word.strip())
-    if not names or set(names) - set(TASKS):
-        raise ValueError(f"--tasks '{tasks}': choose from {', '.join(TASKS)}")
-    cell = Cell(load_recipe(recipe), backbone="", method="", tasks=names)
+    cell = Cell(load_recipe(recipe), backbone="", method="", tasks=o.names(tasks))
     root = o.data_root(cell, data, quiet)
     frames, sources = _sources(cell, root, out)
 
@@ -60,11 +61,14 @@ def cache(
 
 def _sources(cell: Cell, root: Path, out: Path | None) -> tuple["FrameCache", list["Source"]]:
     """The cache of the data set, and the files for it."""
-    from mtl_bench.data.loader import open_dataset
+    from mtl_bench.core.task import tasks_of_cell
+    from mtl_bench.data.samples import open_samples
 
-    training = open_dataset(cell, "train", root, training=True)
-    evaluated = open_dataset(cell, cell.recipe.evaluate.split, root, training=False)
-    sources = training.sources(training=True) + evaluated.sources(training=False)
+    recipe, tasks = cell.recipe, tasks_of_cell(cell)
+    split = recipe.evaluate.split
+    training = open_samples(recipe, tasks, "train", root, training=True).dataset
+    evaluated = open_samples(recipe, tasks, split, root, training=False).dataset
+    sources = training.sources() + evaluated.sources()
     frames = training.on_disk if out is None else training.on_disk.at(out.resolve())
     return frames, list(dict.fromkeys(sources))
 

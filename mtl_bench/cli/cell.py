@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from mtl_bench.cli import options as o
-from mtl_bench.core.config import GRANULARITIES, TASKS, Cell, load_recipe, override
+from mtl_bench.core.config import GRANULARITIES, Cell, load_recipe, override
 
 
 def register(app: typer.Typer) -> None:
@@ -39,7 +39,10 @@ def train(
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="See `list`.", show_default=False)
     ] = None,
-    tasks: Annotated[str, typer.Option(help="Separated by commas.")] = ",".join(TASKS),
+    tasks: Annotated[
+        str | None,
+        typer.Option(help="Separated by commas; without it the recipe's.", show_default=False),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of initial weights, data order and method.")] = 0,
     video: Annotated[
         bool,
@@ -86,13 +89,12 @@ def train(
     else:
         if backbone is None or method is None:
             raise ValueError("say which cell: --backbone NAME and --method NAME, or a cell.json")
-        names = tuple(word.strip() for word in tasks.split(",") if word.strip())
         weights = o.weights(pretrained)
         cell = Cell(
             load_recipe(recipe),
             backbone,
             method,
-            names,
+            o.names(tasks),
             seed,
             video=video,
             single_task=single_task,

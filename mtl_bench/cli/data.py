@@ -1,20 +1,15 @@
 """`data synthetic` and `data check`; `data cache` has a file of its own."""
 
 import re
-from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from mtl_bench.cli import options as o
 from mtl_bench.cli.cache import cache
 from mtl_bench.core import config
-from mtl_bench.data import layouts
-
-if TYPE_CHECKING:
-    from mtl_bench.data.check import Report
-    from mtl_bench.data.check_kitti import KittiReport
 
 
 class Layout(StrEnum):
@@ -52,7 +47,8 @@ def synthetic(
     if match is None:
         raise ValueError(f"--size '{size}' is not HxW, such as 128x256")
     height, width = map(int, match.groups())
-    from mtl_bench.data import synthetic as scene_writer
+    from mtl_bench.data import scenes as scene_writer
+    from mtl_bench.data.scenes.settings import CITYSCAPES, KITTI
 
     scene_writer.write(
         out,
@@ -64,7 +60,7 @@ def synthetic(
         seed,
         frames=frames,
         progress=not quiet,
-        layout=layouts.KITTI if layout is Layout.kitti else layouts.CITYSCAPES,
+        layout=KITTI if layout is Layout.kitti else CITYSCAPES,
     )
     typer.echo(str(out))
 
@@ -73,59 +69,21 @@ def check(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Root of the data set.")],
     deep: Annotated[bool, typer.Option("--deep", help="Decode every file, too.")] = False,
 ) -> None:
-    """Report what a data set holds, Cityscapes' or KITTI's, against what was published, everything
-    that is wrong with it, and which recipes it can run; exit code 1 if anything is wrong."""
-    from mtl_bench.data.check import check as check_cityscapes
-    from mtl_bench.data.check_kitti import check_kitti
+    """Report what a data set holds against what was published, everything that is wrong with it,
+    and which recipes it can run; exit code 1 if anything is wrong."""
+    from mtl_bench.core.dataset import dataset_in, dataset_of
+    from mtl_bench.core.task import tasks_of
 
-    if layouts.layout_of(folder) == layouts.KITTI:
-        kitti = check_kitti(folder, deep)
-        lines, problems = [*kitti.summary(), *_kitti_recipes(kitti)], len(kitti.problems)
-    else:
-        report = check_cityscapes(folder, deep=deep)
-        lines, problems = [*report.summary(), *_cityscapes_recipes(report)], len(report.problems)
+    kind = dataset_in(folder)
+    if kind is None:
+        raise ValueError(o.no_data_set_in(folder))
+    report = kind.check(folder, deep)
+    lines = report.summary()
+    for recipe in map(config.load_recipe, config.recipe_names()):
+        if recipe.data.dataset == report.dataset:
+            tasks = tasks_of(recipe, recipe.tasks, dataset_of(recipe).labels)
+            lines += report.recipe_lines(recipe, tasks)
     for line in lines:
         typer.echo(line)
-    if problems:
+    if report.problems:
         raise typer.Exit(1)
-
-
-def _recipes(datasets: tuple[str, ...]) -> Iterator[config.Recipe]:
-    recipes = map(config.load_recipe, config.recipe_names())
-    return (recipe for recipe in recipes if recipe.data.dataset in datasets)
-
-
-def _kitti_recipes(report: "KittiReport") -> Iterator[str]:
-    """What stands between a tree and the recipes for it, task by task."""
-    from mtl_bench.tasks.depth import protocols
-
-    for recipe in _recipes(("synthetic-kitti" if report.own_lists else "kitti",)):
-        ev, data = recipe.evaluate, recipe.data
-        truths = [protocols.named(name, data.dataset).truth for name in (ev.protocol, *ev.also)]
-        for task in config.TASKS:
-            why = report.obstacle(task, data.train_frames, truths)
-            yield f"recipe {recipe.name}, {task}: {why or 'ready'}"
-
-
-def _cityscapes_recipes(report: "Report") -> Iterator[str]:
-    from mtl_bench.tasks.depth import protocols
-
-    for recipe in _recipes(("cityscapes",)):
-        ev, data = recipe.evaluate, recipe.data
-        also = [protocols.named(name, data.dataset) for name in ev.also]
-        if report.size < (data.height, data.width):
-            own = "{}x{}".format(*report.size)
-            yield f"recipe {recipe.name}: frames of {own} are smaller than its input"
-            continue
-        for task in config.TASKS:
-            found = [report.obstacle(f"{task} {part}") for part in ("training", "evaluation")]
-            if task == "depth":
-                found += [
-                    f"protocol {protocol.name}: no disparity/{protocol.split}"
-                    for protocol in also
-                    if not (report.root / "disparity" / protocol.split).is_dir()
-                ]
-            why = next(filter(None, found), "ready")
-            yield f"recipe {recipe.name}, {task}: {why}"
-        stage = f"{report.unlabelled} frames to label" if report.unlabelled else "no frame to label"
-        yield f"recipe {recipe.name}, --video: {stage}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from mtl_bench.core.config import TASKS, Cell
+from mtl_bench.core.config import Cell
 
 LINE_EVERY_S = 30.0
 
@@ -166,7 +166,7 @@ class Bars:
 def label(cell: Cell) -> str:
     """A cell in a few words: what a reader tells cells of one grid apart by."""
     words = [cell.method, cell.backbone, f"s{cell.seed}"]
-    words += [] if cell.tasks == TASKS else [",".join(cell.tasks)]
+    words += [] if cell.tasks == cell.recipe.tasks else [",".join(cell.tasks)]
     words += ["single-task"] if cell.single_task else []
     words += ["video"] if cell.video else []
     words += [] if cell.granularity == "terms" else [f"by {cell.granularity}"]

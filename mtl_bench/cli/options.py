@@ -3,12 +3,14 @@
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mtl_bench.core.config import Cell
-from mtl_bench.data.layouts import BUILT_IN, IMAGES, LAYOUTS, layout_of
+
+if TYPE_CHECKING:
+    from mtl_bench.core.dataset import Dataset
 
 RUNNING, GRID = "Where and how to run", "Which cells"
 
@@ -125,6 +127,11 @@ SmokeOption = Annotated[
 ]
 
 
+def names(words: str | None) -> tuple[str, ...]:
+    """`a,b` as names; none where nothing is said."""
+    return tuple(word.strip() for word in (words or "").split(",") if word.strip())
+
+
 def echo(quiet: bool) -> Callable[[str], None]:
     """Prints a line, or does not."""
     return (lambda line: None) if quiet else typer.echo
@@ -151,16 +158,19 @@ def locate(cell: Cell, data: Path | None) -> Path | None:
         ValueError: no data set there, one in another layout than the recipe's, or a recipe for a
             data set that only `--data` can find.
     """
+    from mtl_bench.core.dataset import dataset_of
+
+    kind = dataset_of(cell.recipe)
     name = cell.recipe.data.dataset
     if data is not None:
-        layout, expected = _layout(data), LAYOUTS.get(name)
-        if expected not in (None, layout):
+        layout = _layout(data, kind)
+        if layout != kind.layout:
             raise ValueError(
                 f"'{data}' is in {layout}'s layout, but recipe '{cell.recipe.name}' trains on "
                 f"{name}: choose another --data, --recipe or recipe.data.dataset"
             )
         return data.resolve()
-    if name not in BUILT_IN:
+    if not kind.built_in:
         raise ValueError(
             f"recipe '{cell.recipe.name}' trains on {name}: say where it is, --data DIR"
         )
@@ -179,16 +189,25 @@ def any_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:
     return data.resolve()
 
 
-def _layout(data: Path) -> str:
+def _layout(data: Path, kind: "type[Dataset] | None" = None) -> str:
+    """What a folder's files look like; a data set's own layout where it recognises them."""
+    from mtl_bench.core.dataset import dataset_in
+
     if not data.is_dir():
         raise ValueError(f"no data folder '{data}'")
-    layout = layout_of(data)
-    if layout is None:
-        raise ValueError(
-            f"no data set in '{data}': it has neither {IMAGES}/ (Cityscapes) nor days such as "
-            f"2011_09_26/ (KITTI raw)"
-        )
-    return layout
+    if kind is not None and kind.recognises(data):
+        return kind.layout
+    found = dataset_in(data)
+    if found is None:
+        raise ValueError(no_data_set_in(data))
+    return found.layout
+
+
+def no_data_set_in(folder: Path) -> str:
+    """What is wrong with it, in a sentence."""
+    from mtl_bench.core.dataset import layouts
+
+    return f"no data set in '{folder}': it has neither {' nor '.join(layouts())}"
 
 
 def data_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:
@@ -199,9 +218,9 @@ def data_root(cell: Cell, data: Path | None, quiet: bool = False) -> Path:
     """
     root = locate(cell, data)
     if root is None:
-        from mtl_bench.data import synthetic
+        from mtl_bench.core.dataset import dataset_of
 
-        root = synthetic.ensure(cell.recipe.data, progress=not quiet)
+        root = dataset_of(cell.recipe).render(cell.recipe.data, quiet)
     return root
 
 

@@ -80,21 +80,28 @@ def pseudo_label(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from mtl_bench.bench.stored import load_model
+    from mtl_bench.core.dataset import dataset_in, dataset_of
     from mtl_bench.core.device import Engine, choose_device
-    from mtl_bench.evaluate import pseudo_labels
+    from mtl_bench.evaluate.walk import evaluating
 
     engine = Engine(choose_device(device.value), cell.recipe.optim.precision)
     model = load_model(cell, weights, engine)
+    maker = next((task for task in model.tasks if task.makes_labels), None)
+    if maker is None:
+        raise ValueError(f"cell {cell.slug} has no task that makes labels")
     counts: list[int] = []  # frames that have labels: at the start, and after each
     columns = ("labelling frames", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
-        task = bar.add_task("")
+        shown = bar.add_task("")
 
         def show(done: int, total: int) -> None:
             counts.append(done)
-            bar.update(task, completed=done, total=total)
+            bar.update(shown, completed=done, total=total)
 
-        folder = pseudo_labels.ensure(model, cell, root, out, engine.device, show, split)
+        kind = dataset_in(root) or dataset_of(cell.recipe)
+        frames = kind.frames_to_label(root, out, split, cell.recipe)
+        with evaluating(model):
+            folder = maker.label(model, frames, engine.device, show)
     if not quiet:
         written = counts[-1] - counts[0]
         typer.echo(f"{written} frames written, {counts[0]} there already: {folder}")

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mtl_bench.core.config import TASKS, to_dict
+from mtl_bench.core.config import to_dict
 
 if TYPE_CHECKING:
     from mtl_bench.bench.grid import Grid
@@ -25,5 +25,5 @@ def file_of(grid: "Grid", runs: Path) -> Path | None:
 
 
 def tasks_of(grid: "Grid") -> tuple[str, ...]:
-    """Those that some cell has."""
-    return tuple(task for task in TASKS if any(task in cell.tasks for cell in grid.cells))
+    """Those that some cell has, as the cells name them."""
+    return tuple(dict.fromkeys(task for cell in grid.cells for task in cell.tasks))

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from torch import Tensor
 from mtl_bench.core import plugins
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.recipe import Data, Recipe
+
+if TYPE_CHECKING:
+    from mtl_bench.core.task import Task
 
 
 class Kind(Enum):
@@ -81,6 +84,25 @@ class LabelFrames(Protocol):
     def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None: ...
 
 
+class Report(Protocol):
+    """What a look over a folder has found."""
+
+    @property
+    def dataset(self) -> str:
+        """The data set whose recipes it can run."""
+        ...
+
+    @property
+    def problems(self) -> Sequence[Any]: ...
+    def summary(self) -> list[str]:
+        """Lines for a terminal."""
+        ...
+
+    def recipe_lines(self, recipe: Recipe, tasks: "Sequence[Task]") -> Iterator[str]:
+        """What stands between the folder and a recipe, task by task."""
+        ...
+
+
 class Dataset:
     """Base of every data set: one split of it.
 
@@ -103,6 +125,7 @@ class Dataset:
     name: ClassVar[str] = ""  # the file's stem
     takes_further_labels: ClassVar[bool] = False  # the video stage's; then it is a keyword argument
     layout: ClassVar[str] = ""  # what its files look like, in a sentence
+    marks: ClassVar[str] = ""  # what a folder of it has, such as "leftImg8bit/"
     built_in: ClassVar[bool] = False  # rendered on first use; others need --data
     published: ClassVar[Mapping[str, int]] = {}  # frames of each split, as papers report it
     names: list[str]
@@ -147,8 +170,12 @@ class Dataset:
         raise NotImplementedError
 
     @classmethod
-    def check(cls, root: Path, deep: bool = False) -> tuple[list[str], int]:
-        """What a folder holds and lacks, line by line, and the number of problems."""
+    def check(cls, root: Path, deep: bool = False) -> Report:
+        """Look over a folder: what it holds and lacks.
+
+        Args:
+            deep: decode every file, too.
+        """
         raise NotImplementedError
 
     @classmethod
@@ -169,6 +196,12 @@ class Dataset:
             ValueError: no frame to label, or no place for labels.
         """
         raise ValueError(f"{cls.layout or cls.name} has no frames to label")
+
+    on_disk: Any = None  # the FrameCache that `mtl-bench data cache` fills, where there is one
+
+    def sources(self) -> list[Any]:
+        """Files that it can hold."""
+        return []
 
     @property
     def static_from(self) -> str:
@@ -203,3 +236,9 @@ def dataset_in(root: Path) -> type[Dataset] | None:
     """The data set whose layout a folder has; built-in ones have that of another."""
     kinds = (plugins.load("datasets", name) for name in plugins.files("datasets"))
     return next((kind for kind in kinds if not kind.built_in and kind.recognises(root)), None)
+
+
+def layouts() -> list[str]:
+    """What tells the known layouts, for a message."""
+    kinds = (plugins.load("datasets", name) for name in plugins.files("datasets"))
+    return [f"{kind.marks} ({kind.layout})" for kind in kinds if not kind.built_in]

@@ -3,8 +3,8 @@
 Kinds: methods, backbones, tasks, datasets, engines. Searched in this order: the package's own
 folders (the checkout's, or those inside an installed wheel), those of the working directory, and
 what `--plugins` names: a folder with such folders in it, a folder of plug-ins of any kind, or one
-file. A file reached twice counts once; a package's file is its `__init__.py`. `_name.py` is a helper
-that its neighbours import with `from ._name import ...`.
+file. A file reached twice counts once; a package's file is its `__init__.py`. `_name.py` is a
+helper that its neighbours import with `from ._name import ...`.
 
 Finding and describing read the files as text; only `load` runs one.
 """
@@ -303,7 +303,8 @@ def _only_subclass(module: types.ModuleType, base: type[Any], name: str, path: P
         names = ", ".join(c.__name__ for c in found) or "none"
         raise ValueError(f"{path} must define one subclass of {base.__name__}, and defines {names}")
     if hasattr(base, "name"):
-        found[0].name = name
+        vars_of: Any = found[0]
+        vars_of.name = name
     return found[0]
 
 

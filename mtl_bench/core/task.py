@@ -7,10 +7,12 @@ contract alone; nothing else names one.
 Shapes: B images, H x W input pixels, h x w cells of the finest feature map.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -18,12 +20,11 @@ from torch import Tensor, nn
 from mtl_bench.core import plugins
 from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.columns import Column
+from mtl_bench.core.config import Cell
+from mtl_bench.core.dataset import Dataset, LabelFrames, dataset_of
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.terms import Term
-
-if TYPE_CHECKING:
-    from mtl_bench.core.dataset import Dataset
 
 Maps = dict[str, Tensor]  # by name, [B,C,H,W]
 Results = dict[str, Tensor]  # by name, the first axis is B
@@ -153,7 +154,7 @@ class Task:
 
     # --- training ---------------------------------------------------------------------------------
 
-    def begin(self, dataset: "Dataset") -> None:
+    def begin(self, dataset: Dataset) -> None:
         """Learn what matters of the training data before the first step."""
 
     def targets(self, sample: Batch) -> dict[str, Tensor]:
@@ -168,7 +169,7 @@ class Task:
         """Unweighted terms by name; one without labels in this batch is absent."""
         raise NotImplementedError
 
-    def training_protocol(self, dataset: "Dataset") -> dict[str, Any]:
+    def training_protocol(self, dataset: Dataset) -> dict[str, Any]:
         """What a row says of how the task was trained."""
         return {}
 
@@ -218,6 +219,27 @@ class Task:
         """
         return {}
 
+    def label(
+        self,
+        model: nn.Module,
+        frames: LabelFrames,
+        device: torch.device,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Path:
+        """Write pseudo labels of frames, where `makes_labels`; the folder that holds them.
+
+        Args:
+            model: with this task, in evaluation mode.
+            progress: told how many frames have labels, at the start and after each.
+        """
+        raise NotImplementedError
+
+    def write_results(
+        self, out: Path, split: str, frames: Iterable[tuple[str, Results]]
+    ) -> Path | None:
+        """Results of named frames as files of an official evaluator; None where there is none."""
+        return None
+
     def trivial(self, size: Size) -> Trivial | None:
         """The trivial predictor for frames of this size, where there is one."""
         return None
@@ -246,11 +268,22 @@ def tasks_of(recipe: Recipe, names: Iterable[str], labels: LabelSet) -> tuple[Ta
     return tuple(ordered.values())
 
 
+def tasks_of_cell(cell: Cell) -> tuple[Task, ...]:
+    """A cell's tasks, with the classes of its data set."""
+    return tasks_of(cell.recipe, cell.tasks, dataset_of(cell.recipe).labels)
+
+
 def terms_of(tasks: Sequence[Task], granularity: str = "terms") -> tuple[Term, ...]:
     """What a method weighs: the terms of these tasks, or the tasks as sums of them."""
     if granularity == "tasks":
         return tuple(Term(task.name, task.name, task.kind, 1.0, task.terms) for task in tasks)
     return tuple(term for task in tasks for term in task.terms)
+
+
+def loss_names() -> set[str]:
+    """Of all tasks that are found: their own names and their terms'."""
+    kinds = {name: plugins.load("tasks", name) for name in plugins.files("tasks")}
+    return {*kinds, *(term.name for kind in kinds.values() for term in kind.terms)}
 
 
 def finish(

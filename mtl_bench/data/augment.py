@@ -2,8 +2,8 @@
 
 N frames of one place (the annotated one and its neighbours) share the geometry and the jitter; the
 intrinsics and every other field follow the geometry, each by its kind. Pixel centres are integers:
-the top-left pixel is (0, 0). Order and ranges are MGNet's; every side is padded with the same colour, and a flip mirrors the
-principal point to W - 1 - cx, as integer centres demand.
+the top-left pixel is (0, 0). Order and ranges are MGNet's; every side is padded with the same
+colour, and a flip mirrors the principal point to W - 1 - cx, as integer centres demand.
 
 Frames of 1024 x 2048 set the pace: only what a crop shows is resized, and a worker changes colours
 block by block, so that what a block needs stays in the processor's cache.

@@ -1,21 +1,27 @@
 """Look over a whole data set in Cityscapes' layout and report everything that is wrong at once."""
 
 from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
+from mtl_bench.core.dataset import NEIGHBOURS
+from mtl_bench.core.recipe import Recipe
+from mtl_bench.core.task import Task
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data import png
 from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE, Kind
 
 PUBLISHED_FRAMES = {"train": 2975, "val": 500, "test": 1525}  # of the real Cityscapes
-# What a run needs: which split, which files of every annotated frame
-NEEDS: dict[str, tuple[str, tuple[Kind, ...]]] = {
-    "panoptic training": ("train", (IMAGE, CAMERA, LABELS)),
-    "depth training": ("train", (IMAGE, CAMERA, SEQUENCE)),
-    "panoptic evaluation": ("val", (IMAGE, CAMERA, LABELS)),
-    "depth evaluation": ("val", (IMAGE, CAMERA, DISPARITY)),
+# What a run needs of every annotated frame: which split, which fields
+NEEDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "panoptic training": ("train", ("instance_ids",)),
+    "depth training": ("train", (NEIGHBOURS,)),
+    "panoptic evaluation": ("val", ("instance_ids",)),
+    "depth evaluation": ("val", ("depth_m",)),
 }
+_FILES = {"instance_ids": LABELS, "depth_m": DISPARITY, NEIGHBOURS: SEQUENCE}  # fields are from
 _KINDS = (IMAGE, LABELS, SEQUENCE, CAMERA, DISPARITY)
 _SHOWN = 3  # examples of a problem
 
@@ -53,16 +59,40 @@ class Report:
 
     def obstacle(self, purpose: str) -> str | None:
         """Why a purpose of NEEDS is out of reach; None where nothing is in its way."""
-        split, kinds = NEEDS[purpose]
+        return self._lack(*NEEDS[purpose])
+
+    def _lack(self, split: str, fields: Collection[str]) -> str | None:
+        """What of these fields a split lacks."""
+        kinds = (IMAGE, CAMERA, *(_FILES[name] for name in sorted(fields)))
         if not self.frames.get(split):
             return f"no frames in {IMAGE.folder}/{split}"
         for kind in kinds:
             if not self.present[split, kind.folder]:
                 return f"no {kind.folder}/{split}; unpack {kind.package}"
-        if purpose == "depth training" and self.reprojection_mask != "labels":
+        if NEIGHBOURS in fields and self.reprojection_mask != "labels":
             kinds = (*kinds, files.EGO_MASK)
         count = sum(p.split == split and p.kind in kinds for p in self.problems)
         return f"{count} problem{'s' * (count > 1)}" if count else None
+
+    dataset: ClassVar[str] = "cityscapes"  # whose recipes it can run
+
+    def recipe_lines(self, recipe: Recipe, tasks: Sequence[Task]) -> Iterator[str]:
+        """What stands between the data set and a recipe for it, task by task."""
+        data = recipe.data
+        if self.size < (data.height, data.width):
+            own = "{}x{}".format(*self.size)
+            yield f"recipe {recipe.name}: frames of {own} are smaller than its input"
+            return
+        for task in tasks:
+            found = [self._lack("train", task.needs), self._lack("val", task.truth)]
+            found += [
+                f"protocol {metric.prefix.removesuffix('.')}: no {DISPARITY.folder}/{metric.split}"
+                for metric in task.metrics()
+                if metric.prefix and not (self.root / DISPARITY.folder / metric.split).is_dir()
+            ]
+            yield f"recipe {recipe.name}, {task.name}: {next(filter(None, found), 'ready')}"
+        stage = f"{self.unlabelled} frames to label" if self.unlabelled else "no frame to label"
+        yield f"recipe {recipe.name}, --video: {stage}"
 
     def summary(self) -> list[str]:
         """Lines for a terminal: counts, problems with examples, what the data set is good for."""

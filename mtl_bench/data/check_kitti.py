@@ -5,11 +5,13 @@ tree of 95,000 images takes seconds. `deep` decodes every file.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 
+from mtl_bench.core.recipe import Recipe
+from mtl_bench.core.task import Task
 from mtl_bench.data import kitti_files as files
 from mtl_bench.data import kitti_splits as splits
 from mtl_bench.data import png, velodyne
@@ -63,24 +65,35 @@ class KittiReport:
     own_lists: bool = False
     predicted_labels: bool = False
 
-    def obstacle(self, task: str, choice: str, truths: Iterable[str]) -> str | None:
+    @property
+    def dataset(self) -> str:
+        """Whose recipes it can run."""
+        return "synthetic-kitti" if self.own_lists else "kitti"
+
+    def recipe_lines(self, recipe: Recipe, tasks: Sequence[Task]) -> Iterator[str]:
+        """What stands between the tree and a recipe for it, task by task."""
+        for task in tasks:
+            why = self.obstacle(task, recipe.data.train_frames)
+            yield f"recipe {recipe.name}, {task.name}: {why or 'ready'}"
+
+    def obstacle(self, task: Task, choice: str) -> str | None:
         """Why a task cannot be trained and tested; None where nothing is in its way.
 
         Args:
             choice: of training frames, as `recipe.data.train_frames`.
-            truths: kinds of depth maps that test frames must have.
         """
         count = self.trainable[choice]
         if not count:
             other = self.trainable["all"]
             hint = f"; recipe.data.train_frames=all has {other}" if other else ""
             return f"no frame to train on{hint}"
-        if task == "panoptic" and self.labelled[choice] < count:
+        if "instance_ids" in task.needs and self.labelled[choice] < count:
             return (
                 f"{count - self.labelled[choice]} training frames have no labels; make them with "
                 f"'{PSEUDO_LABEL} {self.root}'"
             )
-        lacking = [truth for truth in truths if task == "depth" and not self.truth[truth]]
+        truths = [metric.truth for metric in task.metrics() if "depth_m" in task.truth]
+        lacking = [truth for truth in truths if not self.truth[truth]]
         if lacking:
             return f"no test frame has {PACKAGES[lacking[0]]}"
         return f"{len(self.problems)} problems" if self.problems else None

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames
+from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames, Report
 from mtl_bench.core.recipe import Data, Recipe
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data import frame_cache
@@ -46,6 +46,7 @@ class Cityscapes(Dataset):
     static_ids: ClassVar[tuple[int, ...]] = (files.EGO_ID, files.SKY_ID)
     takes_further_labels = True
     layout = "Cityscapes"
+    marks = "leftImg8bit/"
     published: ClassVar[Mapping[str, int]] = {"train": 2975, "val": 500, "test": 1525}
 
     def __init__(
@@ -78,16 +79,17 @@ class Cityscapes(Dataset):
         return (root / IMAGE.folder).exists()
 
     @classmethod
-    def check(cls, root: Path, deep: bool = False) -> tuple[list[str], int]:
+    def check(cls, root: Path, deep: bool = False) -> Report:
         from mtl_bench.data.check import check
 
-        report = check(root, deep=deep)
-        return report.summary(), len(report.problems)
+        return check(root, deep=deep)
 
     @classmethod
     def image_files(cls, root: Path, split: str) -> dict[str, Path]:
         folder = root / IMAGE.folder / split
-        return {name: files.file_of(folder, IMAGE, name) for name in files.annotated_names(root, split)}
+        return {
+            name: files.file_of(folder, IMAGE, name) for name in files.annotated_names(root, split)
+        }
 
     @classmethod
     def frames_to_label(
@@ -185,7 +187,7 @@ class Cityscapes(Dataset):
     def _folder(self, kind: Package) -> Path:
         return self.root / kind.folder / self.split
 
-    def _file(self, kind: Kind, name: str) -> Path:
+    def _file(self, kind: Package, name: str) -> Path:
         return files.file_of(self._folder(kind), kind, name)
 
     def _image_file(self, name: str) -> Path:

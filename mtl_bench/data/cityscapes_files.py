@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.labels import DIVISOR, LARGEST_ID
 from mtl_bench.data import png
 from mtl_bench.data.labels import KNOWN_LABEL_IDS
-from mtl_bench.core.labels import DIVISOR, LARGEST_ID
 
 
 @dataclass(frozen=True)

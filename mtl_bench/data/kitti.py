@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames
+from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames, Report
 from mtl_bench.core.recipe import Data, Recipe
 from mtl_bench.data import frame_cache, velodyne
 from mtl_bench.data import kitti_files as files
@@ -31,6 +31,7 @@ from mtl_bench.data.cityscapes_files import (
 from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.kitti_splits import Frame
 from mtl_bench.data.labels import CITYSCAPES19
+from mtl_bench.data.png import to_size
 from mtl_bench.data.pseudo_frames import KittiFrames
 
 # Which depth maps a frame may have, the first that exists wins
@@ -72,6 +73,7 @@ class Kitti(Dataset):
     truths: ClassVar[tuple[str, ...]] = ("improved", "velodyne")
     static_ids: ClassVar[tuple[int, ...]] = (EGO_ID, SKY_ID)
     layout = "KITTI raw"
+    marks = "days such as 2011_09_26/"
 
     def __init__(
         self,
@@ -107,11 +109,10 @@ class Kitti(Dataset):
         return root.is_dir() and any(files.is_date(path.name) for path in root.iterdir())
 
     @classmethod
-    def check(cls, root: Path, deep: bool = False) -> tuple[list[str], int]:
+    def check(cls, root: Path, deep: bool = False) -> Report:
         from mtl_bench.data.check_kitti import check_kitti
 
-        report = check_kitti(root, deep)
-        return report.summary(), len(report.problems)
+        return check_kitti(root, deep=deep)
 
     @classmethod
     def image_files(cls, root: Path, split: str) -> dict[str, Path]:
@@ -296,15 +297,6 @@ class Kitti(Dataset):
 
     def _to_input(self, array: NDArray, path: Path, interpolation: int) -> NDArray:
         return to_size(array, self.data.height, self.data.width, interpolation)
-
-
-def to_size(array: NDArray, height: int, width: int, interpolation: int) -> NDArray:
-    """[height,width,...]; area means, where they are asked for, turn bilinear when they enlarge."""
-    if array.shape[:2] == (height, width):
-        return array
-    if interpolation == cv2.INTER_AREA and (height > array.shape[0] or width > array.shape[1]):
-        interpolation = cv2.INTER_LINEAR
-    return cv2.resize(array, (width, height), interpolation=interpolation)
 
 
 def check_calibrated(path: Path, size: tuple[int, ...], camera: files.Camera) -> None:

@@ -12,6 +12,7 @@ beside it, in a folder `data_depth_annotated` or not. Every error is a ValueErro
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +22,17 @@ from numpy.typing import NDArray
 
 from mtl_bench.data import png
 from mtl_bench.data.kitti_splits import CAMERAS, Frame
-from mtl_bench.data.layouts import is_date
 
 CAMERA_HEIGHT_M = 1.65  # of every drive, above the ground (Geiger et al., IJRR 2013)
 RECORD = "pseudo_labels.json"  # in the root where the labels are a network's
 DEPTH_PACKAGE = "data_depth_annotated"
+_DATE = re.compile(r"\d{4}_\d\d_\d\d")
 _CALIBRATION, _SCANNER = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
+
+
+def is_date(name: str) -> bool:
+    """Whether a folder is called as KITTI's days of recording: 2011_09_26."""
+    return bool(_DATE.fullmatch(name))
 
 
 class Tree:

@@ -115,8 +115,8 @@ class _Batches(torch.utils.data.Dataset):
         self.samples = samples
 
     def __getitem__(self, slots: list[Slot]) -> tuple[list[str], dict[str, Tensor]] | ValueError:
-        """A batch's names and tensors, or what is wrong with a file: torch would bury that line in a
-        traceback. A plain dictionary is what torch knows how to pin."""
+        """A batch's names and tensors, or what is wrong with a file: torch would bury that line in
+        a traceback. Plain lists and dictionaries are what torch knows how to pin."""
         try:
             return _collate_shared(_drawn(self.samples, slots), len(slots))
         except ValueError as error:

@@ -1,6 +1,6 @@
 """PNG files that are read whole or not at all: decoders hand back half a picture without a word."""
 
-import zlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,11 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL.PngImagePlugin import PngImageFile
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES = 33  # signature and IHDR
-_TAIL_BYTES = 12  # IEND
+_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk, the same in every file
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,17 @@ def read(path: Path, bits: int, color: bool = False) -> NDArray[Any]:
     Raises:
         ValueError: the file is missing, truncated, damaged or of another bit depth.
     """
-    data = _read_bytes(path)
-    check_bits(path, _parse_header(path, data), bits)
-    _check_chunks(path, data)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+    check_bits(path, _parse(path, data, data), bits)
+    try:
+        PngImageFile(io.BytesIO(data)).verify()
+    except Exception as error:  # Pillow's have no class in common
+        raise ValueError(
+            f"{path}: damaged PNG (checksum); copy or unpack the file again"
+        ) from error
     flag = cv2.IMREAD_COLOR if color else cv2.IMREAD_UNCHANGED
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
     if image is None:
@@ -47,15 +56,11 @@ def read_header(path: Path) -> Header:
     """
     try:
         with path.open("rb") as file:
-            head = file.read(_HEADER_BYTES)
-            file.seek(max(file.seek(0, 2) - _TAIL_BYTES, 0))
-            tail = file.read()
+            start = file.read(_HEADER_BYTES)
+            file.seek(max(file.seek(0, io.SEEK_END) - len(_END), 0))
+            return _parse(path, start, file.read())
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-    header = _parse_header(path, head)
-    if tail[4:8] != b"IEND":
-        raise _truncated(path)
-    return header
 
 
 def check_bits(path: Path, header: Header, bits: int) -> None:
@@ -64,36 +69,20 @@ def check_bits(path: Path, header: Header, bits: int) -> None:
         raise ValueError(f"{path}: {header.bits}-bit PNG where {bits} bits are expected")
 
 
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+def _parse(path: Path, start: bytes, end: bytes) -> Header:
+    """The header, by a file's first bytes, once its last ones show that it is whole."""
+    if not start.startswith(_SIGNATURE):
+        raise ValueError(f"{path}: not a PNG file" if start else f"{path}: the file is empty")
+    if end.rfind(_END) < 0:  # Pillow does not look at what follows the name of the last chunk
+        raise ValueError(f"{path}: truncated PNG; copy or unpack the file again")
+    width, height = (int.from_bytes(start[i : i + 4]) for i in (16, 20))
+    return Header(height, width, start[24])
 
 
-def _parse_header(path: Path, data: bytes) -> Header:
-    if not data.startswith(_SIGNATURE):
-        raise ValueError(f"{path}: not a PNG file" if data else f"{path}: the file is empty")
-    if len(data) < _HEADER_BYTES:
-        raise _truncated(path)
-    width, height = (int.from_bytes(data[i : i + 4]) for i in (16, 20))
-    return Header(height, width, data[24])
-
-
-def _check_chunks(path: Path, data: bytes) -> None:
-    """Walk from chunk to chunk up to IEND, comparing checksums: length, type, content, CRC-32."""
-    view, start = memoryview(data), len(_SIGNATURE)
-    while start + 12 <= len(data):
-        end = start + 12 + int.from_bytes(view[start : start + 4])
-        if end > len(data):
-            break
-        if zlib.crc32(view[start + 4 : end - 4]) != int.from_bytes(view[end - 4 : end]):
-            raise ValueError(f"{path}: damaged PNG (checksum); copy or unpack the file again")
-        if view[start + 4 : start + 8] == b"IEND":
-            return
-        start = end
-    raise _truncated(path)
-
-
-def _truncated(path: Path) -> ValueError:
-    return ValueError(f"{path}: truncated PNG; copy or unpack the file again")
+def to_size(array: NDArray, height: int, width: int, interpolation: int) -> NDArray:
+    """[height,width,...]; area means, where they are asked for, turn bilinear when they enlarge."""
+    if array.shape[:2] == (height, width):
+        return array
+    if interpolation == cv2.INTER_AREA and (height > array.shape[0] or width > array.shape[1]):
+        interpolation = cv2.INTER_LINEAR
+    return cv2.resize(array, (width, height), interpolation=interpolation)

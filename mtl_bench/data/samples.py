@@ -1,7 +1,7 @@
 """Samples: a data set's frames as the network and the tasks want them.
 
-In training a sample is an augmented frame, its neighbours in time where a task needs them, and what
-tasks make of its fields; in evaluation it is the plain frame with the truth at the frame's own size.
+In training a sample is an augmented frame, its neighbours in time where a task needs them, and
+what tasks make of its fields; in evaluation it is the plain frame with the truth at its own size.
 """
 
 import copy

@@ -51,7 +51,7 @@ class Network(nn.Module):
                         f"task '{task.name}' names a decoder or head '{taken.pop()}', as another "
                         f"task does: rename it"
                     )
-                ours.update(own)
+                ours.update(dict(own.items()))
             self._parts[task.name] = part
 
     def features(self, normalized_B3HW: Tensor) -> tuple[list[Tensor], Tensor]:
@@ -87,7 +87,7 @@ class Network(nn.Module):
 class SideBySide(nn.Module):
     """Networks that were each trained alone on one task, on the same image one after another."""
 
-    def __init__(self, networks: Iterable[Network]):
+    def __init__(self, networks: Iterable[nn.Module]):
         super().__init__()
         self.networks = nn.ModuleList(networks)
 
@@ -180,7 +180,7 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
 def side_by_side(models: Iterable[Model]) -> Model:
     """One model to evaluate and to time; it shares nothing and is not trained."""
     models = list(models)
-    net = SideBySide(model.net for model in models)  # type: ignore[arg-type]
+    net = SideBySide(model.net for model in models)
     return Model(net, [task for model in models for task in model.tasks])
 
 

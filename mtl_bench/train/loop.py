@@ -12,10 +12,9 @@ from torch import Tensor, nn
 from mtl_bench.core import plugins
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
-from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.device import Engine, initial_weights, seed_for
 from mtl_bench.core.method import Composed, LossMethod, Method
-from mtl_bench.core.task import Task, tasks_of, terms_of
+from mtl_bench.core.task import Task, tasks_of_cell, terms_of
 from mtl_bench.core.terms import Term
 from mtl_bench.data.loader import train_batches
 from mtl_bench.data.samples import open_samples
@@ -132,7 +131,7 @@ def build(cell: Cell, engine: Engine) -> tuple[Model, Method, torch.optim.Optimi
     optim = cell.recipe.optim
     if optim.batch < 2:
         raise ValueError("optim.batch must be at least 2: batch statistics of 1x1 maps need two")
-    tasks = tasks_of(cell.recipe, cell.tasks, dataset_of(cell.recipe).labels)
+    tasks = tasks_of_cell(cell)
     with initial_weights(cell.seed):
         model = build_model(cell, tasks)
     method = build_method(cell, terms_of(tasks, cell.granularity))

@@ -15,12 +15,11 @@ import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.core.labels import LabelSet
+from mtl_bench.core.labels import DIVISOR, LabelSet
 from mtl_bench.show import render
 from mtl_bench.show.figures.frames import Shown
 from mtl_bench.show.predict.files import OVERLAP, denser
 from mtl_bench.show.predict.point_cloud import PointCloud, from_prediction
-from mtl_bench.core.labels import DIVISOR
 
 TEMPLATE = "cloud.html.j2"
 POINTS = 500_000  # at most: 11 bytes each, 4/3 of that in base64, are 7.3 MB

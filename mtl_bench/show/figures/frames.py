@@ -10,9 +10,9 @@ from mtl_bench.bench import results
 from mtl_bench.bench.stored import load_model
 from mtl_bench.core.config import Cell, did_you_mean
 from mtl_bench.core.device import Engine, choose_device
+from mtl_bench.core.labels import LabelSet
 from mtl_bench.data import cityscapes_files as cityscapes
 from mtl_bench.data import kitti_files, kitti_splits
-from mtl_bench.core.labels import LabelSet
 from mtl_bench.data.layouts import KITTI, layout_of
 from mtl_bench.show.predict import Predicted, Predictor
 from mtl_bench.show.predict.cameras import Given, Mounted, camera_of

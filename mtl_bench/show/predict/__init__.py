@@ -14,14 +14,13 @@ import torch
 from numpy.typing import NDArray
 
 from mtl_bench.core import config
-from mtl_bench.core.geometry import scale_intrinsics
 from mtl_bench.core.batch import Batch
-from mtl_bench.core.labels import LabelSet
+from mtl_bench.core.geometry import scale_intrinsics
+from mtl_bench.core.labels import LabelSet, class_of_instance_id
 from mtl_bench.data.labels import labels_of
 from mtl_bench.evaluate.walk import evaluating, predict
 from mtl_bench.model import Model
 from mtl_bench.tasks.panoptic import postprocess
-from mtl_bench.core.labels import class_of_instance_id
 
 METRES, HEIGHTS, UNSCALED = "m", "camera heights", "network units"
 SQUEEZED = 1.25  # a change of shape by more is worth a note

@@ -15,9 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from mtl_bench.core.geometry import back_project
-from mtl_bench.core.labels import LabelSet
+from mtl_bench.core.labels import DIVISOR, LabelSet, class_of_instance_id
 from mtl_bench.show.predict import Image, Predicted, without_surface
-from mtl_bench.core.labels import DIVISOR, class_of_instance_id
 
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 _VERTEX = np.dtype(

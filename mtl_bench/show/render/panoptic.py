@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.core.labels import IGNORE, LabelSet
+from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet, class_of_instance_id
 from mtl_bench.show.render import canvas
 from mtl_bench.show.render.canvas import Image
-from mtl_bench.core.labels import DIVISOR, class_of_instance_id
 
 STRENGTH = 0.65  # of the colours over the image
 SHADES = (0.0, 0.45, -0.35, 0.25, 0.6, -0.15)  # towards white, or below 0 towards black

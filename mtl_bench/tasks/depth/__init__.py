@@ -70,17 +70,26 @@ class Depth(Task):
     after = ("panoptic",)  # the ground, which the scale is taken from
     averages_flip = True
     columns = (
-        *(
-            Column(
-                name, f"depth_median.{name}", title, better, digits, unit, "median-scaled", **more
-            )
-            for name, title, better, digits, unit, more in (
-                ("abs_rel", "AbsRel", -1, 3, "", {"in_delta": True, "short": True}),
-                ("rmse", "RMSE", -1, 2, "m", {"in_delta": True, "headline": True}),
-                ("delta1", "delta1", +1, 3, "", {"in_delta": True}),
-            )
+        Column(
+            *("abs_rel", "depth_median.abs_rel", "AbsRel", -1, 3),
+            note="median-scaled",
+            in_delta=True,
+            short=True,
         ),
-        Column("rmse_dgc", "depth_dgc.rmse", "RMSE dgc", -1, 2, "m", "dgc-scaled", short=True),
+        Column(
+            *("rmse", "depth_median.rmse", "RMSE", -1, 2, "m"),
+            note="median-scaled",
+            in_delta=True,
+            headline=True,
+        ),
+        Column(
+            *("delta1", "depth_median.delta1", "delta1", +1, 3),
+            note="median-scaled",
+            in_delta=True,
+        ),
+        Column(
+            *("rmse_dgc", "depth_dgc.rmse", "RMSE dgc", -1, 2, "m"), note="dgc-scaled", short=True
+        ),
     )
 
     # --- network ----------------------------------------------------------------------------------
@@ -164,7 +173,7 @@ class Depth(Task):
             depth_B1HW, camera.K_B33, camera.height_m_B, ground_BHW, pitch_rad_B=camera.pitch_rad_B
         )
         if size not in (None, tuple(depth_B1HW.shape[2:])):
-            maps = self.resized({"inverse": maps["inverse"]}, size)  # type: ignore[arg-type]
+            maps = self.resized({"inverse": maps["inverse"]}, size)
             depth_B1HW = depth_from_inverse(maps["inverse"].float())
         depth_m_B1HW = depth_B1HW * scale_B.view(-1, 1, 1, 1)
         return {"depth": depth_B1HW, "scale": scale_B, "source": source_B, "depth_m": depth_m_B1HW}

@@ -4,7 +4,8 @@ Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021) after Panoptic-DeepLab (C
 2020): a semantic decoder, and an instance decoder for a heat map of centers and offsets to them.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,14 @@ from torch import Tensor, nn
 
 from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.columns import Column
+from mtl_bench.core.dataset import LabelFrames
 from mtl_bench.core.labels import IGNORE, LabelSet, class_of_instance_id
 from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.task import Frame, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
 from mtl_bench.model.layers import Decoder, Head, full, init_fan_in
-from mtl_bench.tasks.panoptic import grouping
+from mtl_bench.tasks.panoptic import grouping, pseudo_labels
+from mtl_bench.tasks.panoptic.files import write_panoptic
 from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_loss
 from mtl_bench.tasks.panoptic.metrics import PanopticQuality, SemanticIoU
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
@@ -133,7 +136,7 @@ class Panoptic(Task):
         """
         seen_BHW = class_BHW = grouping.classes(maps["semantic"])
         if size not in (None, tuple(seen_BHW.shape[1:])):
-            maps = self.resized(maps, size)  # type: ignore[arg-type]
+            maps = self.resized(maps, size)
             class_BHW = grouping.classes(maps["semantic"])
         panoptic_BHW = grouping.panoptic(
             class_BHW, maps["center"], maps["offset"], self.labels.things, self.recipe.evaluate
@@ -152,6 +155,23 @@ class Panoptic(Task):
             "top_k": ev.top_k,
             "stuff_area": ev.stuff_area,
         }
+
+    def label(
+        self,
+        model: nn.Module,
+        frames: LabelFrames,
+        device: torch.device,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Path:
+        return pseudo_labels.label(self, model, frames, device, progress)
+
+    def write_results(self, out: Path, split: str, frames: Iterable[tuple[str, Results]]) -> Path:
+        """As cityscapesscripts' panoptic evaluator reads them."""
+        ids = (
+            (name, grouping.to_instance_ids(results["panoptic"], self.labels).numpy())
+            for name, results in frames
+        )
+        return write_panoptic(out, split, ids)
 
     def trivial(self, size: Size) -> Trivial:
         return MostFrequentClass(self.labels, self.recipe, size)

@@ -2,8 +2,8 @@
 
 Naive-Student's idea (Chen et al., ECCV 2020) as MGNet uses it: predictions averaged over scales and
 mirror images, grouped into instances, written as the data set wants them with a record of what
-made them, `<out>/pseudo_labels.json`. Where a data set has no human labels, a model that was trained
-on another one labels the training frames.
+made them, `<out>/pseudo_labels.json`. Where a data set has no human labels, a model that was
+trained on another one labels the training frames.
 
 Departures from MGNet's public code: small stuff segments stay (a small pole is still a pole), and
 human labels are neither copied nor touched. Shapes: B frames, C classes, H x W pixels.
@@ -30,7 +30,6 @@ from mtl_bench.core.plain import to_dict
 from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Maps, Size, Task
 from mtl_bench.data import png
-from mtl_bench.model import Model
 from mtl_bench.tasks.panoptic import grouping
 
 RECORD = "pseudo_labels.json"
@@ -40,8 +39,7 @@ GROUPING = ("center_threshold", "nms_kernel", "top_k")  # what of config.Evaluat
 
 def label(
     task: Task,
-    model: Model,
-    recipe: Recipe,
+    model: nn.Module,
     frames: LabelFrames,
     device: torch.device,
     progress: Callable[[int, int], None] | None = None,
@@ -51,9 +49,9 @@ def label(
     Stopped and called again it goes on, and on the CPU ends with the same bytes.
 
     Args:
-        task: whose maps these are, with its labels.
+        task: whose maps these are; of its recipe, `pseudo` says how to predict, `evaluate` how to
+            group pixels.
         model: in evaluation mode.
-        recipe: `pseudo` says how to predict, `evaluate` how to group pixels.
         progress: told how many frames have labels, at the start and after each.
 
     Returns:
@@ -63,6 +61,7 @@ def label(
         ValueError: options without meaning, labels of another making, or a prediction that is not
             finite.
     """
+    recipe = task.recipe
     options = recipe.pseudo
     if not options.scales or min(options.scales) <= 0:
         raise ValueError(f"pseudo.scales must be positive numbers, not {list(options.scales)}")
@@ -97,9 +96,7 @@ def pass_sizes(recipe: Recipe, size: Size | None = None) -> list[Size]:
     return [(scaled(height, scale), scaled(width, scale)) for scale in recipe.pseudo.scales]
 
 
-def average(
-    task: Task, net: nn.Module, image_B3HW: Tensor, sizes: list[Size], flip: bool
-) -> Maps:
+def average(task: Task, net: nn.Module, image_B3HW: Tensor, sizes: list[Size], flip: bool) -> Maps:
     """Means over passes at these sizes and, with `flip`, of the mirrored image; at its own size."""
     passes = [(size, mirrored) for size in sizes for mirrored in (False, True)[: 1 + flip]]
     sums = _one_pass(task, net, image_B3HW, *passes[0])
@@ -155,7 +152,7 @@ def instance_ids(maps: Maps, recipe: Recipe, labels: LabelSet) -> NDArray[np.uin
 
 def _predictions(
     task: Task,
-    model: Model,
+    model: nn.Module,
     recipe: Recipe,
     frames: LabelFrames,
     done: set[str],
@@ -179,7 +176,7 @@ def _predictions(
         images = [png.read(frames.image(name), bits=8, color=True) for name in batch]
         image_B3HW = torch.stack([_to_input(image, size) for image in images]).to(device)
         sizes = pass_sizes(recipe, size)
-        maps = average(task, model.net, image_B3HW.float() / 255, sizes, flip)
+        maps = average(task, model.get_submodule("net"), image_B3HW.float() / 255, sizes, flip)
         if not all(map_.isfinite().all() for map_ in maps.values()):
             raise ValueError(f"the prediction is not finite in a frame of {batch}")
         for slot, (name, image) in enumerate(zip(batch, images, strict=True)):
@@ -190,7 +187,7 @@ def _predictions(
 
 def _to_input(image_HW3: NDArray[np.uint8], size: Size) -> Tensor:
     """[3,H,W] at the input's size, as the reader resizes frames."""
-    return torch.from_numpy(to_size(image_HW3, *size, cv2.INTER_AREA)).permute(2, 0, 1)
+    return torch.from_numpy(png.to_size(image_HW3, *size, cv2.INTER_AREA)).permute(2, 0, 1)
 
 
 # --- files ----------------------------------------------------------------------------------------

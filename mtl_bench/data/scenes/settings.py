@@ -9,9 +9,9 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
-from mtl_bench.data.layouts import CITYSCAPES
-from mtl_bench.data.synthetic import render
+from mtl_bench.data.scenes.render import RENDERER_VERSION
 
+CITYSCAPES, KITTI = "Cityscapes", "KITTI raw"  # layouts of files
 SPLITS = ("train", "val", "test")
 _FAST = [cv2.IMWRITE_PNG_COMPRESSION, 2]
 
@@ -29,7 +29,7 @@ class Settings:
     frames: int
     annotated: int  # index of the frame that has labels
     min_instance_area: int  # visible pixels below which a thing is written as a group
-    renderer_version: int = render.RENDERER_VERSION
+    renderer_version: int = RENDERER_VERSION
     layout: str = CITYSCAPES
 
     def __post_init__(self) -> None:
@@ -50,6 +50,11 @@ class Settings:
         return self.train_scenes, self.val_scenes, self.test_scenes
 
     @property
+    def video(self) -> tuple[int, int, int, int]:
+        """Height, width, number of frames and the annotated one, of every scene."""
+        return self.height, self.width, self.frames, self.annotated
+
+    @property
     def scenes(self) -> list[tuple[int, int]]:
         """(split, scene) of all scenes in a fixed order."""
         return [(split, i) for split, count in enumerate(self.counts) for i in range(count)]
@@ -66,12 +71,11 @@ class Settings:
     def key(self) -> str:
         return hashlib.sha256(json.dumps(self.values, sort_keys=True).encode()).hexdigest()[:12]
 
+    def write(self, root: Path) -> None:
+        """Leave beside the data set what it was made from."""
+        (root / "synthetic.json").write_text(json.dumps(self.values, indent=4) + "\n")
+
 
 def write_png(path: Path, image: NDArray) -> None:
     if not cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, _FAST):
         raise OSError(f"cannot write {path}")
-
-
-def write_record(root: Path, settings: Settings) -> None:
-    """What the data set was made from, beside it."""
-    (root / "synthetic.json").write_text(json.dumps(settings.values, indent=4) + "\n")

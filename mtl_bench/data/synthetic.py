@@ -16,4 +16,4 @@ class Synthetic(Cityscapes):
     def render(cls, data: Data, quiet: bool = False) -> Path:
         from mtl_bench.data import scenes
 
-        return scenes.ensure(data, cls.layout, progress=not quiet)
+        return scenes.ensure(data, progress=not quiet, layout=cls.layout)

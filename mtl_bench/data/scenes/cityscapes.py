@@ -13,30 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtl_bench.data.labels import CITYSCAPES19
-from mtl_bench.data.synthetic import render
-from mtl_bench.data.synthetic.camera import (
-    BASELINE_M,
-    FRAMES_PER_S,
-    FloatArray,
-    context_from_target,
-)
-from mtl_bench.data.synthetic.settings import SPLITS, Settings, write_png, write_record
+from mtl_bench.data.scenes import render
+from mtl_bench.data.scenes.rays import FloatArray, context_from_target
+from mtl_bench.data.scenes.settings import SPLITS, Settings, write_png
 
+BASELINE_M = 0.22  # Cityscapes'; half a disparity step is < 2 % of 80 m from 32x64 on
+FRAMES_PER_S = 17.0
 _CITY_SCENES = 50
 _SUPERCATEGORIES = (
     "flat", "flat", "construction", "construction", "construction", "object", "object", "object",
     "nature", "nature", "sky", "human", "human", *["vehicle"] * 6,
 )  # fmt: skip
 _CATEGORIES = [
-    {
-        "id": x.label_id,
-        "name": x.name,
-        "color": x.color,
-        "supercategory": s,
-        "isthing": int(x.is_thing),
-    }
+    {"id": x.label_id, "name": x.name, "color": x.color, "supercategory": s,
+     "isthing": int(x.is_thing)}
     for x, s in zip(CITYSCAPES19.labels, _SUPERCATEGORIES, strict=True)
-]
+]  # fmt: skip
 _EVALUATED = {label.label_id: label for label in CITYSCAPES19.labels}
 
 
@@ -61,13 +53,7 @@ def place(settings: Settings, split: int, scene: int) -> tuple[str, str]:
 
 def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict[str, Any]:
     """Render and write one scene; returns its entries of the split's panoptic JSON."""
-    scene = render.draw_scene(
-        (settings.seed, split, number),
-        settings.height,
-        settings.width,
-        settings.frames,
-        settings.annotated,
-    )
+    scene = render.draw_scene((settings.seed, split, number), *settings.video)
     name = SPLITS[split]
     city, stem = place(settings, split, number)
 
@@ -88,11 +74,7 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
     write_png(path("gtFine", target, "gtFine_labelIds.png"), seen.label_HW)
     disparity = encode_disparity(seen.depth_HW, scene.camera.fx)
     write_png(path("disparity", target, "disparity.png"), disparity)
-    for kind, values in (
-        ("camera", _camera(scene)),
-        ("vehicle", _vehicle(scene)),
-        ("egomotion", _egomotion(scene)),
-    ):
+    for kind, values in _records(scene).items():
         text = json.dumps(values, indent=4, sort_keys=True)
         path(kind, target, f"{kind}.json").write_text(text + "\n")
     image_id = f"{stem}_{target:06d}"
@@ -119,22 +101,14 @@ def panoptic(ids_HW: NDArray[np.uint16], image_id: str) -> tuple[NDArray[np.uint
         segments.append({"id": number, "category_id": label.label_id, "area": int(mask.sum()),
                          "bbox": box, "iscrowd": int(group and label.is_thing)})  # fmt: skip
     height, width = ids_HW.shape
-    entry = {
-        "id": image_id,
-        "width": width,
-        "height": height,
-        "file_name": f"{image_id}_gtFine_leftImg8bit.png",
-    }
-    annotation = {
-        "image_id": image_id,
-        "file_name": f"{image_id}_gtFine_panoptic.png",
-        "segments_info": segments,
-    }
-    return picture, {"image": entry, "annotation": annotation}
+    file_name = f"{image_id}_gtFine_leftImg8bit.png"
+    entry = {"id": image_id, "width": width, "height": height, "file_name": file_name}
+    annotation = {"image_id": image_id, "file_name": f"{image_id}_gtFine_panoptic.png"}
+    return picture, {"image": entry, "annotation": {**annotation, "segments_info": segments}}
 
 
 def write_summary(root: Path, settings: Settings, entries: list[dict[str, Any]]) -> None:
-    """The panoptic JSON of every split, and what the data set was made from."""
+    """The panoptic JSON of every split."""
     for split, name in enumerate(SPLITS):
         own = sorted((e for e in entries if e["split"] == split), key=lambda e: e["sort"])
         if own:
@@ -145,38 +119,33 @@ def write_summary(root: Path, settings: Settings, entries: list[dict[str, Any]])
             }
             text = json.dumps(content, sort_keys=True, indent=4)
             (root / "gtFine" / f"cityscapes_panoptic_{name}.json").write_text(text)
-    write_record(root, settings)
 
 
-def _camera(scene: render.Scene) -> dict[str, dict[str, float]]:
-    """Extrinsics in the ISO 8855 vehicle frame (x forward, y left, z up; metres and radians)."""
-    camera = scene.camera
+def _records(scene: render.Scene) -> dict[str, dict[str, Any]]:
+    """The JSON files beside a frame, by folder; metres and radians.
+
+    The camera's extrinsics and the odometry are in the ISO 8855 vehicle frame (x forward, y left,
+    z up), in which yaw counts to the left. Egomotion has matrices [4,4] with
+    X_context = T X_target in camera axes (x right, y down, z forward), None beyond the snippet.
+    """
+    camera, motion, target = scene.camera, scene.motion, scene.annotated
+
+    def transform(frame: int) -> Any:
+        inside = 0 <= frame < len(motion.poses)
+        pose = motion.poses[target]
+        return context_from_target(pose, motion.poses[frame]).tolist() if inside else None
+
     return {
-        "extrinsic": {
-            "baseline": BASELINE_M, "pitch": scene.motion.pitch_rad, "roll": 0.0, "x": 1.7,
-            "y": 0.0, "yaw": 0.0, "z": camera.mount_m,
+        "camera": {
+            "extrinsic": {
+                "baseline": BASELINE_M, "pitch": motion.pitch_rad, "roll": 0.0, "x": 1.7,
+                "y": 0.0, "yaw": 0.0, "z": camera.mount_m,
+            },
+            "intrinsic": {"fx": camera.fx, "fy": camera.fy, "u0": camera.u0, "v0": camera.v0},
         },
-        "intrinsic": {"fx": camera.fx, "fy": camera.fy, "u0": camera.u0, "v0": camera.v0},
+        "vehicle": {
+            "gpsHeading": 0.0, "gpsLatitude": 0.0, "gpsLongitude": 0.0, "outsideTemperature": 20.0,
+            "speed": motion.step_m * FRAMES_PER_S, "yawRate": -motion.yaw_step_rad * FRAMES_PER_S,
+        },
+        "egomotion": {"previous": transform(target - 1), "next": transform(target + 1)},
     }  # fmt: skip
-
-
-def _vehicle(scene: render.Scene) -> dict[str, float]:
-    """Odometry; ISO 8855 counts yaw to the left as positive."""
-    return {
-        "gpsHeading": 0.0, "gpsLatitude": 0.0, "gpsLongitude": 0.0, "outsideTemperature": 20.0,
-        "speed": scene.motion.step_m * FRAMES_PER_S,
-        "yawRate": -scene.motion.yaw_step_rad * FRAMES_PER_S,
-    }  # fmt: skip
-
-
-def _egomotion(scene: render.Scene) -> dict[str, Any]:
-    """4x4 matrices T, X_context = T X_target, camera axes (x right, y down, z forward), metres."""
-    poses, target = scene.motion.poses, scene.annotated
-
-    def transform(frame: int) -> list[list[float]] | None:
-        if not 0 <= frame < len(poses):
-            return None
-        matrix: list[list[float]] = context_from_target(poses[target], poses[frame]).tolist()
-        return matrix
-
-    return {"previous": transform(target - 1), "next": transform(target + 1)}

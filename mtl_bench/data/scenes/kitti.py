@@ -10,6 +10,8 @@
 Frames between a drive's first and last have labels, depth and a scan. As with KITTI's, one test
 frame in 16 has no improved depth map (45 of 697 have none). No date is one of KITTI's: nobody shall
 take these scenes for it. The camera, on the roof as KITTI's, sees no car below it and stands level.
+The laser scanner stands straight above it, so that the distance ahead of the scanner, of which
+KITTI makes ground truth, is the camera's depth.
 """
 
 from datetime import UTC, datetime, timedelta
@@ -17,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mtl_bench.data.synthetic import lidar, render
-from mtl_bench.data.synthetic.camera import Camera, DoubleArray, FloatArray
-from mtl_bench.data.synthetic.settings import SPLITS, Settings, write_png, write_record
+from mtl_bench.data.scenes import render
+from mtl_bench.data.scenes.rays import Camera, DoubleArray, FloatArray
+from mtl_bench.data.scenes.settings import SPLITS, Settings, write_png
 
 MOUNT_M = 1.65
 BASELINE_M = 0.54
@@ -29,6 +32,11 @@ FRAMES_PER_S = 10.0
 DATES = tuple(f"2000_01_0{day}" for day in range(1, 6))
 WITHOUT_IMPROVED = 16  # every 16th test scene
 LISTS = {"train": "eigen_zhou_files", "val": "eigen_val_files", "test": "eigen_test_files"}
+BEAMS = 64
+UP_DEG, DOWN_DEG = 2.0, -24.8  # elevation of the outer beams, as the HDL-64E's
+STEP_DEG = 0.18  # between two shots of a beam
+RANGE_M = 120.0
+ABOVE_M = 0.08  # the camera
 _CAMERA_STREAM = 2  # of the seed; 1 is the motion's
 
 
@@ -59,14 +67,8 @@ def place(settings: Settings, split: int, number: int) -> tuple[str, str]:
 def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict[str, Any]:
     """Render and write one drive; returns what its split's list says of it."""
     date, drive = place(settings, split, number)
-    scene = render.draw_scene(
-        (settings.seed, split, number),
-        settings.height,
-        settings.width,
-        settings.frames,
-        settings.annotated,
-        camera_of(settings, date),
-    )
+    camera = camera_of(settings, date)
+    scene = render.draw_scene((settings.seed, split, number), *settings.video, camera)
     improved = SPLITS[split] != "test" or number % WITHOUT_IMPROVED != WITHOUT_IMPROVED - 1
 
     def path(folder: str, frame: int, suffix: str = ".png") -> Path:
@@ -85,7 +87,7 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
             if improved:
                 stored = encode_depth(seen.depth_HW)
                 write_png(path("proj_depth/groundtruth/image_02", frame), stored)
-            cloud = lidar.scan(seen.depth_HW, scene.camera, _brightness(seen))
+            cloud = scan(seen.depth_HW, scene.camera, _brightness(seen))
             path("velodyne_points/data", frame, ".bin").write_bytes(cloud.astype("<f4").tobytes())
     for folder in ("image_02", "oxts"):
         _timestamps(root / date / drive / folder, settings.frames)
@@ -94,7 +96,7 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
 
 
 def write_summary(root: Path, settings: Settings, entries: list[dict[str, Any]]) -> None:
-    """Calibration of every date, the lists of frames, and what the data set was made from."""
+    """Calibration of every date and the lists of frames."""
     lists = root / "data_splits"
     lists.mkdir()
     for split, name in enumerate(SPLITS):
@@ -104,16 +106,68 @@ def write_summary(root: Path, settings: Settings, entries: list[dict[str, Any]])
     for date in sorted({entry["sort"][: len(DATES[0])] for entry in entries}):
         camera = camera_of(settings, date)
         (root / date / "calib_cam_to_cam.txt").write_text(_cameras(camera))
-        rotation, translation = lidar.mounting(camera, LEFT_M)
+        rotation, translation = mounting(camera, LEFT_M)
         scanner = {"R": rotation, "T": translation, "delta_f": np.zeros(2), "delta_c": np.zeros(2)}
         (root / date / "calib_velo_to_cam.txt").write_text(_calibration(scanner))
-    write_record(root, settings)
 
 
 def encode_depth(depth_m_HW: FloatArray) -> np.ndarray:
     """KITTI's uint16 depth: 256 a metre, 0 = none, or farther than 16 bits hold."""
     stored = np.round(depth_m_HW.astype(np.float64) * 256)
     return np.where(stored < 65536, stored, 0).astype(np.uint16)
+
+
+# --- the laser scanner ----------------------------------------------------------------------------
+
+
+def scan(depth_m_HW: FloatArray, camera: Camera, reflectance_HW: FloatArray) -> NDArray[np.float32]:
+    """64 beams that turn, sampled from the exact depth map at the pixels they come nearest to.
+
+    What the camera does not see is not in the scan: no point shines through from behind an edge.
+
+    Returns:
+        Points [N,4]: x ahead, y left, z up, metres; reflectance.
+    """
+    rows, columns = _pixels(camera)
+    z = depth_m_HW[rows, columns].astype(np.float64)
+    hit = (z > 0) & (z < RANGE_M)
+    rows, columns, z = rows[hit], columns[hit], z[hit]
+    x = (columns - camera.u0) / camera.fx * z
+    y = (rows - camera.v0) / camera.fy * z
+    points = np.stack([z, -x, -y - ABOVE_M, reflectance_HW[rows, columns]], 1)
+    return points.astype(np.float32)
+
+
+def _pixels(camera: Camera) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the pixels that are shot at, each once."""
+    half = np.ceil(np.degrees(np.arctan(camera.width / camera.fx)) / STEP_DEG) * STEP_DEG
+    azimuth = np.radians(np.arange(-half, half, STEP_DEG))
+    elevation = np.radians(np.linspace(UP_DEG, DOWN_DEG, BEAMS))
+    columns = camera.u0 + camera.fx * np.tan(azimuth)[None] + 0 * elevation[:, None]
+    rows = camera.v0 - camera.fy * np.tan(elevation)[:, None] / np.cos(azimuth)[None]
+    pixels = np.stack([np.round(rows), np.round(columns)], -1).reshape(-1, 2).astype(np.int64)
+    inside = (pixels >= 0).all(1) & (pixels < (camera.height, camera.width)).all(1)
+    row, column = np.unique(pixels[inside], axis=0).T
+    return row, column
+
+
+def mounting(camera: Camera, left_m: float) -> tuple[DoubleArray, DoubleArray]:
+    """R [3,3] and T [3] of `calib_velo_to_cam.txt`: from the scanner's axes to camera 00's.
+
+    KITTI's ground truth puts a point that projects to u into pixel round(u) - 1, as its tools count
+    from 1. Ours count from 0, so R leans by that one pixel: without it, every truth would be off by
+    one, half a degree in images this small.
+
+    Args:
+        left_m: where the left camera's axes lie from camera 00's.
+    """
+    R_33 = np.array([[1 / camera.fx, -1, 0], [1 / camera.fy, 0, -1], [1, 0, 0]])
+    return R_33, np.array([-left_m, -ABOVE_M, 0])
+
+
+def _brightness(seen: render.Truth) -> FloatArray:
+    """Reflectance 0..1 [H,W], one a class: sheet metal and signs more than tar and leaves."""
+    return (seen.label_HW.astype(np.float32) * 37 % 100) / 100
 
 
 # --- text files -----------------------------------------------------------------------------------
@@ -168,8 +222,3 @@ def _timestamps(folder: Path, frames: int) -> None:
     times = (start + timedelta(seconds=i / FRAMES_PER_S) for i in range(frames))
     text = "".join(f"{time:%Y-%m-%d %H:%M:%S.%f}000\n" for time in times)
     (folder / "timestamps.txt").write_text(text)
-
-
-def _brightness(seen: render.Truth) -> FloatArray:
-    """Reflectance 0..1 [H,W], one a class: sheet metal and signs more than tar and leaves."""
-    return (seen.label_HW.astype(np.float32) * 37 % 100) / 100
