@@ -1,15 +1,20 @@
 """A tiny data set in Cityscapes' layout, written with OpenCV: noise images, a few segments."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mtl_bench.core import config
+from mtl_bench.core.dataset import NEIGHBOURS, Dataset
 from mtl_bench.data.cityscapes import Cityscapes
+from mtl_bench.data.samples import Samples
+from mtl_bench.tasks.panoptic import Panoptic
 
 HEIGHT, WIDTH = 16, 32
+LOSS = config.Loss(center_sigma=2.0, small_area=10)
 CAMERA = {
     "extrinsic": {"baseline": 0.209313, "pitch": 0.038, "roll": 0.0, "x": 1.7, "y": 0.1, "z": 1.22},
     "intrinsic": {"fx": 2262.52, "fy": 2265.3, "u0": 16.98, "v0": 8.137},
@@ -60,15 +65,30 @@ def write_tree(root: Path, frames: int = 3, split: str = "train", size=(HEIGHT, 
     return root
 
 
-def open_tree(root: Path, split: str = "train", **changes) -> Cityscapes:
+def open_tree(root: Path, split: str = "train", **changes) -> Samples:
+    """Samples as two tasks want them: one with instances, one that compares frames in time."""
+    augment = changes.pop("augment", config.Augment())
     data = changes.pop("data", config.Data(height=HEIGHT, width=WIDTH))
-    settings = {
-        "video": True,
-        "panoptic": True,
-        "augment": config.Augment(),
-        "loss": config.Loss(center_sigma=2.0, small_area=10),
-    }
-    return Cityscapes(root, split, data, **{**settings, **changes})
+    return open_samples_of(Cityscapes, root, split, data, augment, **changes)
+
+
+def open_samples_of(
+    kind: type[Dataset],
+    root: Path,
+    split: str,
+    data: config.Data,
+    augment: config.Augment | None,
+    video: bool = True,
+    panoptic: bool = True,
+    loss: config.Loss = LOSS,
+    **changes,
+) -> Samples:
+    training = augment is not None
+    needs = {NEIGHBOURS if training else "depth_m"} if video else set()
+    needs |= {"instance_ids"} if panoptic else set()
+    dataset = kind(root, split, data, needs=needs, training=training, **changes)
+    task = Panoptic(replace(config.Recipe(), loss=loss), dataset.labels)
+    return Samples(dataset, augment, [task.targets] if panoptic else [])
 
 
 def put_ego_mask(root: Path, size=(HEIGHT, WIDTH)) -> np.ndarray:

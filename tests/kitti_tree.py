@@ -4,10 +4,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from cityscapes_tree import open_samples_of
 
 from mtl_bench.core import config
 from mtl_bench.data.kitti import Kitti
 from mtl_bench.data.kitti_splits import Frame
+from mtl_bench.data.samples import Samples
 
 HEIGHT, WIDTH = 16, 48
 SIZES = {"2011_09_26": (16, 48), "2011_09_28": (15, 47)}  # as KITTI's, days differ a little
@@ -91,17 +93,11 @@ def write_tree(root: Path) -> Path:
     return root
 
 
-def open_tree(root: Path, split: str = "train", **changes) -> Kitti:
-    settings = {
-        "video": True,
-        "panoptic": True,
-        "augment": config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
-        if split == "train"
-        else None,
-        "loss": config.Loss(center_sigma=2.0, small_area=10),
-    }
+def open_tree(root: Path, split: str = "train", **changes) -> Samples:
+    plain = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
+    augment = changes.pop("augment", plain if split == "train" else None)
     data = changes.pop("data", config.Data(dataset="kitti", height=HEIGHT, width=WIDTH))
-    return Kitti(root, split, data, **{**settings, **changes})
+    return open_samples_of(Kitti, root, split, data, augment, **changes)
 
 
 def names(drive: str, *numbers: int, camera: str = "02") -> list[str]:

@@ -56,28 +56,28 @@ def test_training_sample_without_changes_shows_the_files(tree):
     assert sample.names == [NAME]
     expected = rgb(file(tree, "leftImg8bit", NAME, "leftImg8bit.png"))
     assert torch.equal(sample.image_B3HW, expected)
-    assert torch.equal(sample.clean_B3HW, expected)
+    assert torch.equal(sample.fields["clean"], expected)
     for place, frame in enumerate(("000018", "000020")):
         path = file(tree, "leftImg8bit_sequence", f"aachen_000000_{frame}", "leftImg8bit.png")
-        assert torch.equal(sample.context_BN3HW[place], rgb(path))
+        assert torch.equal(sample.fields["neighbours"][place], rgb(path))
     torch.testing.assert_close(
-        sample.K_B33, torch.tensor([[2262.52, 0, 16.98], [0, 2265.3, 8.137], [0, 0, 1]])
+        sample.camera.K_B33, torch.tensor([[2262.52, 0, 16.98], [0, 2265.3, 8.137], [0, 0, 1]])
     )
-    assert sample.camera_height_m_B.item() == pytest.approx(1.22)
-    assert sample.camera_pitch_rad_B.item() == pytest.approx(0.038)
-    assert sample.instance_ids_BHW is None
-    assert sample.depth_m_BHW is None
+    assert sample.camera.height_m_B.item() == pytest.approx(1.22)
+    assert sample.camera.pitch_rad_B.item() == pytest.approx(0.038)
+    assert "instance_ids" not in sample.fields
+    assert "depth_m" not in sample.fields
 
     ids = instance_ids()
     masked = np.isin(ids, [1, 23])
-    assert np.array_equal(sample.reprojection_mask_BHW.numpy(), ~masked)
+    assert np.array_equal(sample.fields["reprojection_mask"].numpy(), ~masked)
     targets = panoptic_targets(ids.astype(np.int32), CITYSCAPES20, dataset.loss)
-    assert np.array_equal(sample.semantic_BHW.numpy(), targets.semantic)
-    assert np.array_equal(sample.semantic_weight_BHW.numpy(), targets.semantic_weight)
-    assert np.array_equal(sample.center_B1HW[0].numpy(), targets.center)
-    assert np.array_equal(sample.center_weight_B1HW[0].numpy(), targets.center_weight)
-    assert np.array_equal(sample.offset_B2HW.numpy(), targets.offset)
-    assert np.array_equal(sample.offset_weight_B1HW[0].numpy(), targets.offset_weight)
+    assert np.array_equal(sample.fields["semantic"].numpy(), targets.semantic)
+    assert np.array_equal(sample.fields["semantic_weight"].numpy(), targets.semantic_weight)
+    assert np.array_equal(sample.fields["center"][0].numpy(), targets.center)
+    assert np.array_equal(sample.fields["center_weight"][0].numpy(), targets.center_weight)
+    assert np.array_equal(sample.fields["offset"].numpy(), targets.offset)
+    assert np.array_equal(sample.fields["offset_weight"][0].numpy(), targets.offset_weight)
     assert targets.offset_weight.sum() == 24
 
 
@@ -85,12 +85,12 @@ def test_padding_counts_nowhere(tree):
     dataset = open_tree(tree, augment=config.Augment(crop=(HEIGHT + 4, WIDTH + 6)))
     sample = dataset.sample(0, generator())
     assert sample.image_B3HW.shape == (3, HEIGHT + 4, WIDTH + 6)
-    assert (sample.semantic_weight_BHW > 0).sum() == HEIGHT * WIDTH
-    outside = sample.semantic_weight_BHW == 0
-    assert (sample.semantic_BHW[outside] == IGNORE).all()
-    assert not sample.reprojection_mask_BHW[outside].any()
-    assert (sample.center_weight_B1HW[0][outside] == 0).all()
-    assert (sample.offset_weight_B1HW[0][outside] == 0).all()
+    assert (sample.fields["semantic_weight"] > 0).sum() == HEIGHT * WIDTH
+    outside = sample.fields["semantic_weight"] == 0
+    assert (sample.fields["semantic"][outside] == IGNORE).all()
+    assert not sample.fields["reprojection_mask"][outside].any()
+    assert (sample.fields["center_weight"][0][outside] == 0).all()
+    assert (sample.fields["offset_weight"][0][outside] == 0).all()
 
 
 def test_evaluation_sample(tree):
@@ -98,13 +98,13 @@ def test_evaluation_sample(tree):
         sample = open_tree(tree, augment=augment).sample(0, None)
         expected = rgb(file(tree, "leftImg8bit", NAME, "leftImg8bit.png"))
         assert torch.equal(sample.image_B3HW, expected)
-        assert np.array_equal(sample.instance_ids_BHW.numpy(), instance_ids())
-        assert sample.instance_ids_BHW.dtype == torch.int32
-        assert sample.depth_m_BHW.dtype == torch.float32
-        assert sample.depth_m_BHW[5, 5].item() == pytest.approx(23.678742, abs=1e-5)
-        assert sample.depth_m_BHW[0, :2].tolist() == [0, 0]
-        assert sample.context_BN3HW is None
-        assert sample.semantic_BHW is None
+        assert np.array_equal(sample.fields["instance_ids"].numpy(), instance_ids())
+        assert sample.fields["instance_ids"].dtype == torch.int32
+        assert sample.fields["depth_m"].dtype == torch.float32
+        assert sample.fields["depth_m"][5, 5].item() == pytest.approx(23.678742, abs=1e-5)
+        assert sample.fields["depth_m"][0, :2].tolist() == [0, 0]
+        assert "neighbours" not in sample.fields
+        assert "semantic" not in sample.fields
 
 
 def test_large_frames_shrink_and_ground_truth_keeps_its_size(tmp_path):
@@ -114,17 +114,17 @@ def test_large_frames_shrink_and_ground_truth_keeps_its_size(tmp_path):
     original = rgb(file(tmp_path, "leftImg8bit", NAME, "leftImg8bit.png"))
     area = original.reshape(3, HEIGHT, 4, WIDTH, 2).mean((2, 4))
     torch.testing.assert_close(sample.image_B3HW, area, atol=1 / 255, rtol=0)
-    assert sample.context_BN3HW.shape == (2, 3, HEIGHT, WIDTH)
-    assert sample.semantic_BHW.shape == (HEIGHT, WIDTH)
-    assert (sample.semantic_BHW[0] == CITYSCAPES20.index("sky")).all()
+    assert sample.fields["neighbours"].shape == (2, 3, HEIGHT, WIDTH)
+    assert sample.fields["semantic"].shape == (HEIGHT, WIDTH)
+    assert (sample.fields["semantic"][0] == CITYSCAPES20.index("sky")).all()
     expected = [[2262.52 / 2, 0, (16.98 + 0.5) / 2 - 0.5], [0, 2265.3 / 4, (8.137 + 0.5) / 4 - 0.5]]
-    torch.testing.assert_close(sample.K_B33[:2], torch.tensor(expected))
+    torch.testing.assert_close(sample.camera.K_B33[:2], torch.tensor(expected))
 
     evaluated = dataset.sample(0, None)
     assert evaluated.image_B3HW.shape == (3, HEIGHT, WIDTH)
-    assert torch.equal(evaluated.K_B33, sample.K_B33)
-    assert evaluated.instance_ids_BHW.shape == (4 * HEIGHT, 2 * WIDTH)
-    assert evaluated.depth_m_BHW[5, 5].item() == pytest.approx(23.678742, abs=1e-5)  # own fx
+    assert torch.equal(evaluated.camera.K_B33, sample.camera.K_B33)
+    assert evaluated.fields["instance_ids"].shape == (4 * HEIGHT, 2 * WIDTH)
+    assert evaluated.fields["depth_m"][5, 5].item() == pytest.approx(23.678742, abs=1e-5)  # own fx
 
 
 def test_shrunk_labels_are_those_in_the_middle(tmp_path):
@@ -133,8 +133,8 @@ def test_shrunk_labels_are_those_in_the_middle(tmp_path):
     ids[1::3, 1::3] = 26003
     put_png(file(tmp_path, "gtFine", NAME, "gtFine_instanceIds.png"), ids)
     sample = open_tree(tmp_path, augment=PLAIN).sample(0, generator())
-    assert (sample.semantic_BHW == CITYSCAPES20.index("car")).all()
-    assert (sample.offset_weight_B1HW == 1).all()
+    assert (sample.fields["semantic"] == CITYSCAPES20.index("car")).all()
+    assert (sample.fields["offset_weight"] == 1).all()
 
 
 def test_each_task_reads_only_its_files(tree):
@@ -142,31 +142,31 @@ def test_each_task_reads_only_its_files(tree):
         (tree / folder).rename(tree / f"away_{folder}")
     panoptic = open_tree(tree, video=False)
     sample = panoptic.sample(0, generator())
-    assert sample.context_BN3HW is None
-    assert sample.clean_B3HW is None
-    assert sample.reprojection_mask_BHW is None
-    assert sample.semantic_BHW is not None
-    assert panoptic.sample(0, None).depth_m_BHW is None
+    assert "neighbours" not in sample.fields
+    assert "clean" not in sample.fields
+    assert "reprojection_mask" not in sample.fields
+    assert "semantic" in sample.fields
+    assert panoptic.sample(0, "depth_m" not in None).fields
 
     for folder in ("leftImg8bit_sequence", "disparity"):
         (tree / f"away_{folder}").rename(tree / folder)
     (tree / "gtFine").rename(tree / "away_gtFine")
     depth = open_tree(tree, panoptic=False)
     sample = depth.sample(0, generator())
-    assert sample.semantic_BHW is None
-    assert sample.reprojection_mask_BHW.all()
-    assert depth.sample(0, None).instance_ids_BHW is None
+    assert "semantic" not in sample.fields
+    assert sample.fields["reprojection_mask"].all()
+    assert depth.sample(0, "instance_ids" not in None).fields
 
     (tree / "away_gtFine").rename(tree / "gtFine")
     sample = open_tree(tree, panoptic=False, augment=PLAIN).sample(0, generator())
-    assert sample.semantic_BHW is None
-    assert not sample.reprojection_mask_BHW[0].any()  # sky
+    assert "semantic" not in sample.fields
+    assert not sample.fields["reprojection_mask"][0].any()  # sky
 
 
 def test_evaluation_needs_no_neighbours(tree):
     for path in (tree / "leftImg8bit_sequence").rglob("*.png"):
         path.unlink()
-    assert open_tree(tree, augment=None).sample(1, None).depth_m_BHW is not None
+    assert open_tree(tree, augment=None).sample(1, "depth_m" in None).fields
 
 
 def test_cache_changes_nothing_and_saves_reading(tree):
@@ -181,7 +181,7 @@ def test_cache_changes_nothing_and_saves_reading(tree):
     with pytest.raises(ValueError, match="cannot be read"):
         cached.uncached().sample(0, generator(4))
     assert torch.equal(first.image_B3HW, second.image_B3HW)
-    assert torch.equal(first.center_B1HW, second.center_B1HW)
+    assert torch.equal(first.fields["center"], second.fields["center"])
 
 
 def test_each_frame_has_its_own_camera(tree):
@@ -190,8 +190,8 @@ def test_each_frame_has_its_own_camera(tree):
     file(tree, "camera", "aachen_000002_000019", "camera.json").write_text(json.dumps(other))
     dataset = open_tree(tree, augment=PLAIN)
     samples = [dataset.sample(index, generator()) for index in range(3)]
-    assert [s.K_B33[0, 0].item() for s in samples] == pytest.approx([2262.52, 1000, 2262.52])
-    assert samples[1].camera_height_m_B.item() == 2
+    assert [s.camera.K_B33[0, 0].item() for s in samples] == pytest.approx([2262.52, 1000, 2262.52])
+    assert samples[1].camera.height_m_B.item() == 2
 
 
 def test_labelled_sequence_frames_join_the_training(tree, tmp_path_factory):
@@ -213,11 +213,11 @@ def test_labelled_sequence_frames_join_the_training(tree, tmp_path_factory):
     ]
     later = dataset.sample(2, generator())
     assert torch.equal(later.image_B3HW, torch.full((3, HEIGHT, WIDTH), 20.0) / 255)
-    assert torch.equal(later.context_BN3HW[1], torch.full((3, HEIGHT, WIDTH), 21.0) / 255)
-    assert (later.semantic_BHW == CITYSCAPES20.index("road")).all()
-    assert later.K_B33[0, 0].item() == pytest.approx(2262.52)
+    assert torch.equal(later.fields["neighbours"][1], torch.full((3, HEIGHT, WIDTH), 21.0) / 255)
+    assert (later.fields["semantic"] == CITYSCAPES20.index("road")).all()
+    assert later.camera.K_B33[0, 0].item() == pytest.approx(2262.52)
     human = dataset.sample(1, generator())
-    assert (human.semantic_BHW == CITYSCAPES20.index("car")).any()
+    assert (human.fields["semantic"] == CITYSCAPES20.index("car")).any()
     assert dataset.reprojection_mask == "labels"
 
 
@@ -247,7 +247,7 @@ def test_every_frame_of_a_video_data_set_has_neighbours(tmp_path):
         sample = dataset.sample(index, generator())
         for place, step in enumerate((-1, 1)):
             path = file(tmp_path, "leftImg8bit_sequence", neighbour(name, step), "leftImg8bit.png")
-            assert torch.equal(sample.context_BN3HW[place], rgb(path))
+            assert torch.equal(sample.fields["neighbours"][place], rgb(path))
 
 
 # --- without labels -------------------------------------------------------------------------------
@@ -259,8 +259,8 @@ def test_depth_trains_without_labels_and_panoptic_does_not(tree):
     assert (depth.reprojection_mask, depth.needs_automask) == ("none", True)
     for index in range(len(depth)):
         sample = depth.sample(index, generator(index))
-        assert sample.reprojection_mask_BHW.all()
-        assert sample.context_BN3HW.shape == (2, 3, HEIGHT, WIDTH)
+        assert sample.fields["reprojection_mask"].all()
+        assert sample.fields["neighbours"].shape == (2, 3, HEIGHT, WIDTH)
     for video in (True, False):
         with pytest.raises(ValueError, match="missing, one of 3 label files") as error:
             open_tree(tree, video=video)
@@ -272,7 +272,7 @@ def test_panoptic_alone_needs_no_video_at_all(tree):
     dataset = open_tree(tree, video=False)
     assert dataset.reprojection_mask == "labels"
     sample = dataset.sample(0, generator())
-    assert sample.semantic_BHW is not None
+    assert "semantic" in sample.fields
     for name in ("context_BN3HW", "clean_B3HW", "clean_context_BN3HW", "reprojection_mask_BHW"):
         assert getattr(sample, name) is None
     with pytest.raises(ValueError, match="missing, one of 6 neighbour frames"):
@@ -284,7 +284,7 @@ def test_ego_mask_goes_through_the_augmentation(tree):
     ego = put_ego_mask(tree)
     dataset = open_tree(tree, panoptic=False, augment=PLAIN)
     assert (dataset.reprojection_mask, dataset.needs_automask) == ("ego_mask.png", True)
-    assert np.array_equal(dataset.sample(0, generator()).reprojection_mask_BHW.numpy(), ~ego)
+    assert np.array_equal(dataset.sample(0, generator()).fields["reprojection_mask"].numpy(), ~ego)
 
     for path in tree.rglob("*_leftImg8bit.png"):  # so that the image says what the mask must be
         put_png(path, np.where(ego, 255, 0)[..., None].repeat(3, 2).astype(np.uint8))
@@ -296,8 +296,8 @@ def test_ego_mask_goes_through_the_augmentation(tree):
     for seed in range(12):
         sample = dataset.sample(0, generator(seed))
         black = (sample.image_B3HW == 0).all(0)  # padding is gray
-        assert torch.equal(sample.reprojection_mask_BHW, black)
-        flipped += bool(sample.reprojection_mask_BHW[-1].int().argmax() < WIDTH // 2)
+        assert torch.equal(sample.fields["reprojection_mask"], black)
+        flipped += bool(sample.fields["reprojection_mask"][-1].int().argmax() < WIDTH // 2)
     assert 0 < flipped < 12
 
 
@@ -306,13 +306,13 @@ def test_ego_mask_is_for_frames_without_labels(tree):
     labelled = np.isin(instance_ids(), [1, 23])
     dataset = open_tree(tree, augment=PLAIN)
     assert (dataset.reprojection_mask, dataset.needs_automask) == ("labels", False)
-    assert np.array_equal(dataset.sample(0, generator()).reprojection_mask_BHW.numpy(), ~labelled)
+    assert np.array_equal(dataset.sample(0, generator()).fields["reprojection_mask"].numpy(), ~labelled)
 
     file(tree, "gtFine", NAME, "gtFine_instanceIds.png").unlink()
     dataset = open_tree(tree, augment=PLAIN, panoptic=False)
     assert dataset.reprojection_mask == "labels, or ego_mask.png where a frame lacks them"
     assert dataset.needs_automask
-    masks = [dataset.sample(index, generator()).reprojection_mask_BHW.numpy() for index in (0, 1)]
+    masks = [dataset.sample(index, generator()).fields["reprojection_mask"].numpy() for index in (0, 1)]
     assert np.array_equal(masks[0], ~ego)
     assert np.array_equal(masks[1], ~labelled)
 
@@ -329,7 +329,7 @@ def test_ego_mask_shrinks_with_the_frames(tmp_path):
     sample = open_tree(tmp_path, panoptic=False, augment=PLAIN).sample(0, generator())
     small = np.zeros((HEIGHT, WIDTH), bool)
     small[HEIGHT // 2 :, : WIDTH // 2] = True
-    assert np.array_equal(sample.reprojection_mask_BHW.numpy(), ~small)
+    assert np.array_equal(sample.fields["reprojection_mask"].numpy(), ~small)
 
 
 @pytest.mark.parametrize(
@@ -348,7 +348,7 @@ def test_wrong_ego_mask(tree, mask, message):
     with pytest.raises(ValueError, match=f"{tree}/ego_mask.png: {message}") as error:
         open_tree(tree, panoptic=False).sample(0, generator())
     assert one_line(error)
-    assert open_tree(tree, panoptic=False, augment=None).sample(0, None).depth_m_BHW is not None
+    assert open_tree(tree, panoptic=False, augment=None).sample(0, "depth_m" in None).fields
     report = check(tree)
     assert [str(problem) for problem in report.problems] == [str(error.value)]
     assert report.obstacle("depth training") == "1 problem"

@@ -329,7 +329,7 @@ def test_baselines_of_one_task_need_no_truth_of_the_other(root, tmp_path):
 def test_the_official_evaluator_agrees_on_exported_predictions(root, tmp_path):
     def blur(outputs):
         outputs.semantic_BCHW = outputs.semantic_BCHW.roll((2, 3), (2, 3))
-        outputs.center_B1HW[1:, :, :, :64] = 0  # loses a car
+        outputs.fields["center"][1:, :, :, :64] = 0  # loses a car
         return outputs
 
     model = Oracle(CELL, change=blur)
@@ -361,7 +361,7 @@ def truth_through_grouping(root, cell, damage):
     ev = replace(cell.recipe.evaluate, stuff_area=0)
     dataset = open_dataset(cell, "val", root, training=False)
     for batch in eval_batches(dataset, 1):
-        ids = batch.instance_ids_BHW[0].numpy()
+        ids = batch.fields["instance_ids"][0].numpy()
         targets = panoptic_targets(ids, CITYSCAPES20, cell.recipe.loss)
         classes = np.where((ids > 23) & (ids < 1000), IGNORE, targets.semantic)  # crowds
         classes = np.roll(classes, damage, 1)

@@ -86,7 +86,7 @@ def test_evaluation_is_the_same_and_its_truth_keeps_its_size(tree):
     for path, _ in images:
         spoil(path)
     assert_same(batches(), expected)
-    assert expected[0].instance_ids_BHW.shape[1:] == (2 * HEIGHT, 2 * WIDTH)
+    assert expected[0].fields["instance_ids"].shape[1:] == (2 * HEIGHT, 2 * WIDTH)
 
 
 def test_each_task_caches_its_own_files(tree):

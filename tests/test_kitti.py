@@ -110,10 +110,10 @@ def test_the_real_sample_as_a_data_set():
         "depth_truth": {"velodyne": 2},
     }
     sample = dataset.sample(0, None)
-    assert sample.K_B33[0, 2].item() == pytest.approx(609.5593)
-    assert sample.camera_height_m_B.item() == pytest.approx(1.65)
-    assert sample.camera_pitch_rad_B.item() == 0
-    assert torch.count_nonzero(sample.depth_m_BHW) == 19299
+    assert sample.camera.K_B33[0, 2].item() == pytest.approx(609.5593)
+    assert sample.camera.height_m_B.item() == pytest.approx(1.65)
+    assert sample.camera.pitch_rad_B.item() == 0
+    assert torch.count_nonzero(sample.fields["depth_m"]) == 19299
     with pytest.raises(ValueError, match="none of its 4 frames of test has a depth map"):
         open_tree(REAL, "test", truth="improved")
     with pytest.raises(ValueError, match=r"none of the 39810 frames .*train_frames=all"):
@@ -193,14 +193,14 @@ def test_training_frames_have_both_neighbours(tree):
     for place, number in enumerate((3, 5)):
         image = cv2.imread(str(file(tree, TRAIN, "image_02", number)))[..., ::-1]
         expected = torch.from_numpy(image.copy()).permute(2, 0, 1) / 255
-        assert torch.equal(sample.context_BN3HW[place], expected)
+        assert torch.equal(sample.fields["neighbours"][place], expected)
     sky = CITYSCAPES19.index("sky")
-    assert (sample.semantic_BHW[:4] == sky).all()
-    assert not sample.reprojection_mask_BHW[:4].any()
-    assert sample.reprojection_mask_BHW[4:].all()
+    assert (sample.fields["semantic"][:4] == sky).all()
+    assert not sample.fields["reprojection_mask"][:4].any()
+    assert sample.fields["reprojection_mask"][4:].all()
     assert (dataset.reprojection_mask, dataset.needs_automask) == ("labels", False)
     K = torch.tensor([[FOCAL, 0, 23.5], [0, FOCAL, 7.5], [0, 0, 1]])
-    torch.testing.assert_close(sample.K_B33, K)
+    torch.testing.assert_close(sample.camera.K_B33, K)
 
 
 def test_all_frames_train_but_those_that_measure(tree):
@@ -223,7 +223,7 @@ def test_truth_of_test_frames(tree):
     dataset = open_tree(tree, "test")
     assert dataset.names == [*names(TEST, 3, 6, 9), *names(OTHER_DAY, 3, 6)]
     assert dataset.truths == {"improved": 2, "velodyne": 3}
-    scanned, stored = (dataset.sample(index, None).depth_m_BHW for index in (0, 1))
+    scanned, stored = (dataset.sample(index, None).fields["depth_m"] for index in (0, 1))
     assert torch.equal(stored[1:], torch.full((HEIGHT - 1, WIDTH), 5.0))
     assert (stored[0] == 0).all()
     assert set(scanned.unique().tolist()) == {0, WALL_M}
@@ -239,7 +239,7 @@ def test_truth_of_test_frames(tree):
 
 
 def test_improved_maps_in_every_layout(tree):
-    expected = open_tree(tree, "test", truth="improved").sample(0, None).depth_m_BHW
+    expected = open_tree(tree, "test", truth="improved").sample(0, None).fields["depth_m"]
     package = tree.parent / "data_depth_annotated"
     inside = tree / "2011_09_26" / TEST / "proj_depth"
     for source, target in (
@@ -250,7 +250,7 @@ def test_improved_maps_in_every_layout(tree):
     ):
         source.rename(target)
         dataset = open_tree(tree, "test", truth="improved")
-        assert torch.equal(dataset.sample(0, None).depth_m_BHW, expected)
+        assert torch.equal(dataset.sample(0, None).fields["depth_m"], expected)
 
 
 def test_the_nearest_point_of_a_pixel_wins():
@@ -267,34 +267,34 @@ def test_days_of_other_sizes_are_resized_and_measured_at_their_own(tree):
     dataset = open_tree(tree, "test", data=data)
     first, last = dataset.sample(0, None), dataset.sample(4, None)
     assert first.image_B3HW.shape == last.image_B3HW.shape == (3, 8, 24)
-    assert last.K_B33[0, 0].item() == pytest.approx(FOCAL * 24 / 47)
-    assert last.K_B33[1, 1].item() == pytest.approx(FOCAL * 8 / 15)
-    assert last.K_B33[1, 2].item() == pytest.approx((7 + 0.5) * 8 / 15 - 0.5)
-    assert (first.depth_m_BHW.shape, last.depth_m_BHW.shape) == ((16, 48), (15, 47))
-    sizes = [(len(b.names), b.depth_m_BHW.shape[1:]) for b in eval_batches(dataset, 2)]
+    assert last.camera.K_B33[0, 0].item() == pytest.approx(FOCAL * 24 / 47)
+    assert last.camera.K_B33[1, 1].item() == pytest.approx(FOCAL * 8 / 15)
+    assert last.camera.K_B33[1, 2].item() == pytest.approx((7 + 0.5) * 8 / 15 - 0.5)
+    assert (first.fields["depth_m"].shape, last.fields["depth_m"].shape) == ((16, 48), (15, 47))
+    sizes = [(len(b.names), b.fields["depth_m"].shape[1:]) for b in eval_batches(dataset, 2)]
     assert sizes == [(2, (16, 48)), (1, (16, 48)), (2, (15, 47))]
     larger = open_tree(tree, data=config.Data(dataset="kitti", height=17, width=50))
     sample = larger.sample(0, generator())
     assert sample.image_B3HW.shape == (3, 17, 50)
-    assert sample.semantic_BHW.unique().numel() == 3
+    assert sample.fields["semantic"].unique().numel() == 3
 
 
 def test_predicted_labels_are_no_truth(tree):
     dataset = open_tree(tree, "test")
-    assert dataset.sample(0, None).instance_ids_BHW.unique().tolist() == [7, 23, 26001]
+    assert dataset.sample(0, None).fields["instance_ids"].unique().tolist() == [7, 23, 26001]
     (tree / kitti_files.RECORD).write_text("{}")
-    assert open_tree(tree, "test").sample(0, None).instance_ids_BHW is None
-    assert open_tree(tree).sample(0, generator()).semantic_BHW is not None
+    assert open_tree(tree, "test").sample(0, "instance_ids" not in None).fields
+    assert open_tree(tree).sample(0, generator()).fields["semantic"] is not None
     (tree / kitti_files.RECORD).unlink()
     file(tree, TEST, "label_02", 3).unlink()  # metrics over some of the frames would be others
-    assert open_tree(tree, "test").sample(1, None).instance_ids_BHW is None
+    assert open_tree(tree, "test").sample(1, "instance_ids" not in None).fields
 
 
 def test_depth_trains_without_labels(tree):
     shutil.rmtree(tree / "2011_09_26" / TRAIN / "label_02")
     dataset = open_tree(tree, panoptic=False)
     assert (dataset.reprojection_mask, dataset.needs_automask) == ("none", True)
-    assert dataset.sample(0, generator()).reprojection_mask_BHW.all()
+    assert dataset.sample(0, generator()).fields["reprojection_mask"].all()
 
 
 def test_the_right_camera_has_its_own_intrinsics(tree):
@@ -303,7 +303,7 @@ def test_the_right_camera_has_its_own_intrinsics(tree):
     path.write_text(path.read_text().replace("P_rect_03: 20.0", "P_rect_03: 22.0"))
     dataset = open_tree(tree)
     assert dataset.names == [*names(TRAIN, 3, 4, 5), *names(TRAIN, 3, 4, 5, camera="03")]
-    focal = [dataset.sample(index, generator()).K_B33[0, 0].item() for index in (0, 3)]
+    focal = [dataset.sample(index, generator()).camera.K_B33[0, 0].item() for index in (0, 3)]
     assert focal == [20.0, 22.0]
 
 
@@ -622,7 +622,7 @@ def real(tmp_path_factory):
     shutil.copytree(REAL, root, copy_function=os.symlink)
     dataset = open_tree(REAL, "test")
     for index, number in enumerate((3, 6)):
-        depth_m = dataset.sample(index, None).depth_m_BHW.numpy()
+        depth_m = dataset.sample(index, None).fields["depth_m"].numpy()
         put_png(improved(root, TEST, number), (depth_m * 256).round().astype(np.uint16))
     return root
 

@@ -40,15 +40,15 @@ def test_batches_are_stacked(tree):
     (batch,) = take(open_tree(tree), 1)
     assert len(batch.names) == 3
     assert batch.image_B3HW.shape == (3, 3, HEIGHT, WIDTH)
-    assert batch.K_B33.shape == (3, 3, 3)
-    assert batch.camera_height_m_B.shape == (3,)
-    assert batch.context_BN3HW.shape == (3, 2, 3, HEIGHT, WIDTH)
-    assert batch.clean_context_BN3HW.shape == (3, 2, 3, HEIGHT, WIDTH)
-    assert batch.reprojection_mask_BHW.shape == (3, HEIGHT, WIDTH)
-    assert batch.reprojection_mask_BHW.dtype == torch.bool
-    assert batch.semantic_BHW.dtype == torch.int64
-    assert batch.center_B1HW.shape == (3, 1, HEIGHT, WIDTH)
-    assert batch.offset_B2HW.shape == (3, 2, HEIGHT, WIDTH)
+    assert batch.camera.K_B33.shape == (3, 3, 3)
+    assert batch.camera.height_m_B.shape == (3,)
+    assert batch.fields["neighbours"].shape == (3, 2, 3, HEIGHT, WIDTH)
+    assert batch.fields["clean_neighbours"].shape == (3, 2, 3, HEIGHT, WIDTH)
+    assert batch.fields["reprojection_mask"].shape == (3, HEIGHT, WIDTH)
+    assert batch.fields["reprojection_mask"].dtype == torch.bool
+    assert batch.fields["semantic"].dtype == torch.int64
+    assert batch.fields["center"].shape == (3, 1, HEIGHT, WIDTH)
+    assert batch.fields["offset"].shape == (3, 2, HEIGHT, WIDTH)
     assert batch.image_B3HW.is_contiguous()
 
 
@@ -62,7 +62,7 @@ def test_a_batch_splits_into_consecutive_parts(tree):
             values = [getattr(part, field.name) for part in parts]
             if isinstance(values[0], torch.Tensor):
                 assert torch.equal(torch.cat(values), getattr(batch, field.name)), field.name
-    assert batch.split(2)[1].depth_m_BHW is None
+    assert batch.split(2)["depth_m" not in 1].fields
     for size in (4, 0, 7, -2):
         with pytest.raises(ValueError, match=rf"micro_batch = {size} does not divide a batch of 6"):
             batch.split(size)
@@ -187,8 +187,8 @@ def test_evaluation_goes_through_the_split_in_order(tree):
     batches = list(eval_batches(dataset, 3))
     assert [len(batch.names) for batch in batches] == [3, 3, 1]
     assert [name for batch in batches for name in batch.names] == dataset.names
-    assert batches[2].instance_ids_BHW.shape == (1, HEIGHT, WIDTH)
-    assert batches[0].depth_m_BHW.shape == (3, HEIGHT, WIDTH)
+    assert batches[2].fields["instance_ids"].shape == (1, HEIGHT, WIDTH)
+    assert batches[0].fields["depth_m"].shape == (3, HEIGHT, WIDTH)
     for one, two in zip(batches, eval_batches(dataset, 3), strict=True):
         assert_same(one, two)
 
@@ -203,12 +203,12 @@ def cell(**changes):
 def test_a_cell_opens_what_its_tasks_need(tree, dataset):
     both = open_dataset(cell(dataset=dataset), "train", tree, training=True)
     (batch,) = take(both, 1)
-    assert batch.semantic_BHW is not None
-    assert batch.context_BN3HW is not None
+    assert "semantic" in batch.fields
+    assert "neighbours" in batch.fields
     (batch,) = take(open_dataset(cell(tasks=("panoptic",)), "train", tree, training=True), 1)
-    assert batch.context_BN3HW is None
+    assert "neighbours" not in batch.fields
     (batch,) = take(open_dataset(cell(tasks=("depth",)), "train", tree, training=True), 1)
-    assert batch.semantic_BHW is None
+    assert "semantic" not in batch.fields
 
 
 def test_errors(tree):

@@ -408,12 +408,12 @@ def make_batch(size: int = 2, height: int = 16, width: int = 24) -> tuple[Batch,
 def leaves(outputs: Outputs, transforms: Tensor) -> dict[str, list[Tensor]]:
     """What each term must reach, and nothing else."""
     assert outputs.semantic_BCHW is not None
-    assert outputs.center_B1HW is not None
-    assert outputs.offset_B2HW is not None
+    assert "center" in outputs.fields
+    assert "offset" in outputs.fields
     return {
         "semantic": [outputs.semantic_BCHW],
-        "center": [outputs.center_B1HW],
-        "offset": [outputs.offset_B2HW],
+        "center": [outputs.fields["center"]],
+        "offset": [outputs.fields["offset"]],
         "photometric": [*outputs.inverse_depth, transforms],
         "smoothness": [*outputs.inverse_depth],
     }
@@ -438,8 +438,8 @@ def test_terms_without_pixels_are_zero_in_the_graph() -> None:
     batch, outputs, transforms = make_batch()
     for name in ("semantic_weight_BHW", "center_weight_B1HW", "offset_weight_B1HW"):
         setattr(batch, name, torch.zeros_like(getattr(batch, name)))
-    batch.semantic_BHW = torch.full_like(batch.semantic_BHW, 255)  # type: ignore[arg-type]
-    batch.reprojection_mask_BHW = torch.zeros_like(batch.reprojection_mask_BHW)  # type: ignore[arg-type]
+    batch.fields["semantic"] = torch.full_like(batch.fields["semantic"], 255)  # type: ignore[arg-type]
+    batch.fields["reprojection_mask"] = torch.zeros_like(batch.fields["reprojection_mask"])  # type: ignore[arg-type]
     losses = loss_terms(batch, outputs, transforms, config.Loss(), TASKS)
     for name, loss in losses.items():
         assert loss.item() == 0
@@ -492,10 +492,10 @@ def test_automask_switch_reaches_the_loss() -> None:
 
 def test_a_task_without_labels_or_neighbours_has_no_terms() -> None:
     batch, outputs, transforms = make_batch()
-    batch.semantic_BHW = None
+    batch.fields["semantic"] = None
     losses = loss_terms(batch, outputs, transforms, config.Loss(), TASKS)
     assert list(losses) == ["photometric", "smoothness"]
     batch, outputs, _ = make_batch()
-    batch.clean_context_BN3HW = None
+    batch.fields["clean_neighbours"] = None
     losses = loss_terms(batch, outputs, None, config.Loss(), TASKS)
     assert list(losses) == ["semantic", "center", "offset"]

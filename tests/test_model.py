@@ -65,11 +65,11 @@ def test_outputs_have_the_inputs_size():
     model = build_model(TINY, CITYSCAPES20).train()
     outputs = model.net(torch.rand(2, 3, 32, 64))
     assert outputs.semantic_BCHW.shape == (2, 20, 32, 64)
-    assert outputs.center_B1HW.shape == (2, 1, 32, 64)
-    assert outputs.offset_B2HW.shape == (2, 2, 32, 64)
+    assert outputs.fields["center"].shape == (2, 1, 32, 64)
+    assert outputs.fields["offset"].shape == (2, 2, 32, 64)
     assert [depth.shape for depth in outputs.inverse_depth] == [(2, 1, 32, 64)] * 3
-    assert outputs.center_B1HW.min() >= 0
-    assert outputs.center_B1HW.max() <= 1
+    assert outputs.fields["center"].min() >= 0
+    assert outputs.fields["center"].max() <= 1
     assert outputs.inverse_depth[0].max() <= 1 / SMALL.min_depth
     model.eval()
     assert len(model.net(torch.rand(1, 3, 32, 64)).inverse_depth) == 1
@@ -100,7 +100,7 @@ def test_every_parameter_gets_a_gradient():
     outputs = model.net(image)
     transforms = model.pose(image, context)
     assert transforms.shape == (2, 2, 4, 4)
-    parts = [outputs.semantic_BCHW, outputs.center_B1HW, outputs.offset_B2HW, transforms]
+    parts = [outputs.semantic_BCHW, outputs.fields["center"], outputs.fields["offset"], transforms]
     sum(part.square().sum() for part in [*parts, *outputs.inverse_depth]).backward()
     assert [name for name, p in model.named_parameters() if p.grad is None] == []
 

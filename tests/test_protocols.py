@@ -202,7 +202,7 @@ class Seer(nn.Module):
         for dataset in datasets:
             for index in range(len(dataset)):
                 sample = dataset.sample(index, None)
-                self.known.setdefault(sample.image_B3HW.numpy().tobytes(), sample.depth_m_BHW)
+                self.known.setdefault(sample.image_B3HW.numpy().tobytes(), sample.fields["depth_m"])
         self.net = self.answer
 
     def answer(self, image_B3HW):
@@ -384,7 +384,7 @@ def test_flip_averages_the_inverse_depth_and_nothing_else():
         assert said == (FLIP if flip else "none")
     assert results[False].depth_B1HW[0, 0, 0, 0] == pytest.approx(10)
     assert torch.allclose(results[True].depth_B1HW, torch.tensor(5.0))
-    assert torch.equal(results[True].instance_ids_BHW, results[False].instance_ids_BHW)
+    assert torch.equal(results[True].fields["instance_ids"], results[False].fields["instance_ids"])
     assert torch.equal(results[True].class_BHW, results[False].class_BHW)
 
 
@@ -402,10 +402,10 @@ def test_records_are_plain():
 def test_the_main_dataset_has_the_main_truth(kitti_root):
     cell = sized(cell_of("synthetic-kitti", protocol="eigen-raw", split="test"), 32, 96)
     (only,) = open_passes(cell, kitti_root)
-    depth = only.dataset.sample(0, None).depth_m_BHW
+    depth = only.dataset.sample(0, None).fields["depth_m"]
     dense = open_dataset(cell, "test", kitti_root, training=False, truth="improved")
     assert (
         0.2
         < (depth > 0).float().mean()
-        < 0.9 * (dense.sample(0, None).depth_m_BHW > 0).float().mean()
+        < 0.9 * (dense.sample(0, None).fields["depth_m"] > 0).float().mean()
     )

@@ -262,9 +262,9 @@ def test_labelled_frames_are_training_samples(scenes, truth, knowing, tmp_path):
     name = BETWEEN[1]
     sample = dataset.sample(dataset.names.index(name), torch.Generator())
     classes = class_of_instance_id(CITYSCAPES20)[truth[name]]
-    np.testing.assert_array_equal(sample.semantic_BHW.numpy(), classes)
+    np.testing.assert_array_equal(sample.fields["semantic"].numpy(), classes)
     static = ~np.isin(truth[name], (1, 23))
-    np.testing.assert_array_equal(sample.reprojection_mask_BHW.numpy(), static)
+    np.testing.assert_array_equal(sample.fields["reprojection_mask"].numpy(), static)
 
 
 # --- stopped and continued ------------------------------------------------------------------------
@@ -451,9 +451,9 @@ def test_passes_are_averaged():
     image = torch.zeros(1, 3, 16, 32)
     mean = average(net, image, [(16, 32), (8, 32), (32, 16)], flip=False)
     torch.testing.assert_close(mean.probability_BCHW[:, 0], torch.full((1, 16, 32), 0.5))
-    torch.testing.assert_close(mean.center_B1HW, torch.full((1, 1, 16, 32), 0.5))
+    torch.testing.assert_close(mean.fields["center"], torch.full((1, 1, 16, 32), 0.5))
     y, x = 10 * (0.2 + 0.6 * 2 + 0.7 / 2) / 3, 10 * (0.2 + 0.6 + 0.7 * 2) / 3
-    torch.testing.assert_close(mean.offset_B2HW[0, :, 0, 0], torch.tensor([y, x]))
+    torch.testing.assert_close(mean.fields["offset"][0, :, 0, 0], torch.tensor([y, x]))
 
 
 def test_passes_have_sizes_that_the_network_divides():

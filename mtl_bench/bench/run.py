@@ -69,9 +69,7 @@ def run_cell(
     results.write_json(run_dir / "env.json", environment)
 
     tasks = tasks_of_cell(cell)
-    open_walks(
-        cell.recipe, tasks, root
-    )  # what would stop the evaluation is told before the training
+    open_walks(cell.recipe, tasks, root)  # what would stop the evaluation is told at once
     if cell.single_task:
         trained = _trained_apart(cell, run_dir, engine)
     else:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mtl_bench.cli import options as o
-from mtl_bench.core.config import TASKS
+from mtl_bench.core.recipe import Recipe
+
+TASKS = Recipe.tasks
 
 if TYPE_CHECKING:
     from mtl_bench.core.config import Cell
