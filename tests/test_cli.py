@@ -109,7 +109,7 @@ def test_check_of_something_else(tmp_path):
 
 def test_env_tells_the_fingerprint_and_the_versions():
     text = call("env", "--device", "cpu")
-    for stage, roots in provenance.harness_roots().items():
+    for stage, roots in provenance.HARNESS_ROOTS.items():
         assert f"{stage} {fingerprint.fingerprints(stage, roots)['harness']}" in text
     for word in ("torch", "timm", "python", "threads", "git_commit"):
         assert word in text

@@ -153,9 +153,9 @@ def env(device: o.DeviceOption = o.Device.auto) -> None:
     """Print versions, hardware and code as they would stand in a row."""
     from mtl_bench.core.device import choose_device
     from mtl_bench.core.fingerprint import fingerprints
-    from mtl_bench.core.provenance import environment, harness_roots
+    from mtl_bench.core.provenance import HARNESS_ROOTS, environment
 
-    prints = {s: fingerprints(s, roots)["harness"] for s, roots in harness_roots().items()}
+    prints = {s: fingerprints(s, roots)["harness"] for s, roots in HARNESS_ROOTS.items()}
     harness = "  ".join(f"{stage} {print_}" for stage, print_ in prints.items())
     values = {**environment(choose_device(device.value)), "harness": harness}
     for line in o.columns([[key, str(value)] for key, value in values.items()], indent=""):

@@ -129,6 +129,14 @@ class Dataset:
     built_in: ClassVar[bool] = False  # rendered on first use; others need --data
     published: ClassVar[Mapping[str, int]] = {}  # frames of each split, as papers report it
     names: list[str]
+    # Which members make no numbers of a cell, or those of its pseudo labels alone
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {
+        "label": ("frames_to_label",),
+        "show": (
+            *("layout", "marks", "name", "built_in", "published", "recognises", "render", "check"),
+            *("image_files", "sources", "described", "takes_further_labels"),
+        ),
+    }
 
     def __init__(
         self,

@@ -12,7 +12,7 @@ from typing import Any
 
 from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell
-from mtl_bench.core.fingerprint import Root, fingerprints, of_package
+from mtl_bench.core.fingerprint import HARNESS, Root, fingerprints, of_package, ours
 
 PACKAGE = Path(__file__).resolve().parents[1]
 STAMPED_BEFORE = "stamped by an older version"
@@ -37,35 +37,44 @@ def code(cell: Cell) -> Code:
     Raises:
         ValueError: a plug-in that is not there, or is no Python.
     """
+    tasks = [_root("tasks", name) for name in cell.tasks]
+    dataset = _root("datasets", cell.recipe.data.dataset.replace("-", "_"))
+    seen = [*tasks, dataset, backbone_root(cell.backbone)]
     methods = [
         Root(plugins.path_of("methods", name), part="method", base="Method")
         for name in plugins.part_names(cell.method)
     ]
-    given = [*methods, backbone_root(cell.backbone)]
-    return {
-        stage: fingerprints(stage, [*(given if stage == "train" else given[-1:]), *roots])
-        for stage, roots in harness_roots(cell.video).items()
+    found = {
+        stage: fingerprints(stage, [*(methods if stage == "train" else ()), *seen, *roots])
+        for stage, roots in HARNESS_ROOTS.items()
     }
+    if cell.video:
+        labels = fingerprints("label", [*tasks, dataset])
+        found["train"] |= {f"labels by {part}": code for part, code in labels.items()}
+    return found
 
 
 def backbone_root(name: str) -> Root:
     return Root(plugins.path_of("backbones", name), part="backbone", base="Backbone")
 
 
-def harness_roots(video: bool = False) -> dict[str, list[Root]]:
-    """Where each stage of a cell begins in this package."""
-    model = [
-        Root(of_package("model"), ("build_model", "side_by_side")),
-        Root(of_package("core.device"), ("Engine",)),
-        Root(of_package("data.labels"), ("labels_of",)),
-    ]
-    train = [Root(of_package("train.loop"), ("train",))]
-    train += [Root(of_package("evaluate.pseudo_labels"), ("ensure",))] if video else []
-    return {
-        "train": [*train, *model],
-        "evaluate": [Root(of_package("evaluate.walk"), ("evaluate",)), *model],
-        "time": [Root(of_package("bench.stored"), ("time_cell",)), *model],
-    }
+def _root(kind: str, name: str) -> Root:
+    """Of a plug-in that may be this package's own."""
+    path, base = plugins.path_of(kind, name), plugins.BASES[kind][1]
+    return Root(path, part=HARNESS if ours(path) else f"{kind}/{name}.py", base=base)
+
+
+_MODEL = [
+    Root(of_package("model.network"), ("build_model", "side_by_side")),
+    Root(of_package("core.device"), ("Engine",)),
+    Root(of_package("core.task"), ("tasks_of", "finish")),
+]
+# Where each stage of a cell begins in this package
+HARNESS_ROOTS = {
+    "train": [Root(of_package("train.loop"), ("train",)), *_MODEL],
+    "evaluate": [Root(of_package("evaluate.walk"), ("evaluate",)), *_MODEL],
+    "time": [Root(of_package("bench.stored"), ("time_cell",)), *_MODEL],
+}
 
 
 def changes(before: Mapping[str, Any], now: Code, words: Mapping[str, str]) -> dict[str, str]:
@@ -78,7 +87,7 @@ def changes(before: Mapping[str, Any], now: Code, words: Mapping[str, str]) -> d
         return dict.fromkeys(now, STAMPED_BEFORE)
     found = {}
     for stage, parts in now.items():
-        different = [words[part] for part in parts if before[stage].get(part) != parts[part]]
+        different = [words.get(part, part) for part in parts if before[stage].get(part) != parts[part]]
         if different:
             unknown = not before[stage]
             found[stage] = NOT_REPRODUCED if unknown else f"{', '.join(different)} changed"

@@ -118,17 +118,22 @@ class Task:
     categorical: ClassVar[frozenset[str]] = frozenset()  # maps of which `finish` reads the argmax
     makes_labels: ClassVar[bool] = False  # whether the video stage's labels come from it
     averages_flip: ClassVar[bool] = False  # whether `flip_averaged` does anything
-    # Which of a task's members make the numbers of each stage
-    stage_members: ClassVar[Mapping[str, tuple[str, ...]]] = {
+    # Which of a task's members make the numbers of each stage; the others make none
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {
         "train": (
-            *("terms", "needs", "head", "activate", "extra", "training_maps", "targets"),
+            *("terms", "kind", "needs", "head", "activate", "extra", "training_maps", "targets"),
             *("losses", "begin"),
         ),
         "evaluate": (
-            *("truth", "after", "head", "activate", "resized", "flip_averaged", "finish"),
-            *("metrics",),
+            *("truth", "after", "averages_flip", "head", "activate", "resized", "flip_averaged"),
+            *("finish", "metrics"),
         ),
         "time": ("after", "categorical", "head", "activate", "finish", "points"),
+        "label": ("head", "activate", "resized", "label"),
+        "show": (
+            *("columns", "makes_labels", "training_protocol", "protocol", "trivial", "pictures"),
+            *("write_results", "name"),
+        ),
     }
 
     def __init__(self, recipe: Recipe, labels: LabelSet) -> None:
