@@ -133,8 +133,18 @@ class Dataset:
     stage_members: ClassVar[dict[str, tuple[str, ...]]] = {
         "label": ("frames_to_label",),
         "show": (
-            *("layout", "marks", "name", "built_in", "published", "recognises", "render", "check"),
-            *("image_files", "sources", "described", "takes_further_labels"),
+            "name",
+            "layout",
+            "marks",
+            "built_in",
+            "published",
+            "takes_further_labels",
+            "recognises",
+            "render",
+            "check",
+            "image_files",
+            "sources",
+            "described",
         ),
     }
 

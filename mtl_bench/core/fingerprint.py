@@ -30,7 +30,14 @@ HARNESS = "harness"
 # stand in the cell's id.
 EXCLUDED = {
     *("core.config", "core.recipe", "core.plain", "core.plugins", "core.provenance"),
-    *("core.fingerprint", "core.files", "core.quiet", "train.progress", "train.tracking"),
+    *(
+        "core.fingerprint",
+        "core.columns",
+        "core.files",
+        "core.quiet",
+        "train.progress",
+        "train.tracking",
+    ),
     *("train.curve", "bench.claim", "bench.results", "cli", "report", "show"),
 }
 MEMBERS = "stage_members"
@@ -549,7 +556,9 @@ class _Normal:
                 target = Target(path, attributes.pop(0))
             elif (
                 name is not None
-                and not (module and name in (module.statements.keys() | module.imports.keys()))
+                and not (module and name in module.statements)
+                # a package that imports its own submodule binds it to itself
+                and (not module or module.imports.get(name) in (None, Target(path, name)))
                 and (inner := _submodule(path, name)) is not None
             ):
                 target = Target(inner)

@@ -87,7 +87,9 @@ def changes(before: Mapping[str, Any], now: Code, words: Mapping[str, str]) -> d
         return dict.fromkeys(now, STAMPED_BEFORE)
     found = {}
     for stage, parts in now.items():
-        different = [words.get(part, part) for part in parts if before[stage].get(part) != parts[part]]
+        different = [
+            words.get(part, part) for part in parts if before[stage].get(part) != parts[part]
+        ]
         if different:
             unknown = not before[stage]
             found[stage] = NOT_REPRODUCED if unknown else f"{', '.join(different)} changed"
