@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 from mtl_bench.bench import results
 from mtl_bench.cli.app import app
 from mtl_bench.core import config
-from mtl_bench.report import comparison, comparison_files, formats, published
-from mtl_bench.report.groups import SMOKE
+from mtl_bench.report import literature
+from mtl_bench.report import table as formats
+from mtl_bench.report.statistics import SMOKE
 
-TABLES = published.names()
+TABLES = literature.names()
 FRAMES = {"cityscapes": 500, "kitti": 652, "synthetic": 100, "synthetic-kitti": 60}
 DEPTH = {"abs_rel": 0.1, "rmse": 4.2, "delta1": 0.9, "delta2": 0.97, "delta3": 0.99}
 
@@ -60,7 +61,17 @@ def row(dataset="cityscapes", seed=0, metric=None, protocol=None, status="done",
 
 
 def compare(name, rows, **options):
-    return comparison.compare(published.load(name), rows, **options)
+    return literature.compare(literature.load(name), rows, **options)
+
+
+def columns(table):
+    """Those behind the method."""
+    return table.literature.columns[1:]
+
+
+def halves(line, name):
+    cell = literature.cell(line, name)
+    return cell.text, cell.spread
 
 
 def measured(table):
@@ -87,11 +98,11 @@ def test_a_row_of_the_data_set_stands_among_the_published_in_its_order():
     before, own, after = section.lines[place - 1 : place + 2]
     assert (before.printed["pq"], after.printed["pq"]) == ("61.4", "58.8")
     assert (own.count, own.entries["pq"].mean) == (2, 60.5)
-    assert comparison_files.halves(own, "pq") == ("60.5", "\u00b1 0.7")
+    assert halves(own, "pq") == ("60.5", "\u00b1 0.7")
     assert own.what == "measured"
     assert own.texts["frames"] == "500/500"
     assert own.texts["device"] == "A CPU, 2 threads"
-    assert comparison_files.halves(own, "runtime_ms") == ("12.3", "")
+    assert halves(own, "runtime_ms") == ("12.3", "")
 
 
 @pytest.mark.parametrize(
@@ -218,14 +229,14 @@ def built(tmp_path_factory):
         del rows[0]["metric"][name]
     tables = {name: compare(name, rows) for name in TABLES}
     for name, table in tables.items():
-        comparison_files.write(table, folder / name, f"mtl-bench report --table {name}")
+        literature.write(table, folder / name, f"mtl-bench report --table {name}")
     return folder, tables
 
 
 def shown(table, line):
     """What a line's cells are in every spelling but LaTeX's."""
-    names = comparison_files.columns(table)
-    return [" ".join(filter(None, comparison_files.halves(line, name))) for name in names]
+    names = columns(table)
+    return [" ".join(filter(None, halves(line, name))) for name in names]
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -285,15 +296,13 @@ def test_latex_has_every_number_and_compiles(built, name, tmp_path):
     source = (folder / name / "table.tex").read_text(encoding="ascii")
     assert "?" not in source
     body = source[source.index(r"\midrule") : source.index(r"\bottomrule")]
-    names = [
-        n for n in comparison_files.columns(tables[name]) if n in tables[name].literature.narrow
-    ]
+    names = [n for n in columns(tables[name]) if n in tables[name].literature.narrow]
     lines = [line.removesuffix(r" \\") for line in body.splitlines() if " & " in line]
     for found, line in zip(lines, tables[name].lines, strict=True):
         _, origin, *cells, count = re.split(r"(?<!\\) & ", found)
         assert (origin.partition("$")[0], count) == (line.kind, line.seeds)
         for cell, column in zip(cells, names, strict=True):
-            mean, spread = comparison_files.halves(line, column)
+            mean, spread = halves(line, column)
             assert cell.partition(r"{\scriptsize")[0] == formats.tex(mean)
             assert spread.replace("\u00b1", r"$\pm$") in cell
         letters = re.findall("[a-z]", origin.partition("$")[2])
@@ -318,13 +327,13 @@ def compile_latex(table, folder):
 def test_values_that_are_missing_are_dashes(built):
     _, tables = built
     lines = [line for line in tables["cityscapes"].lines if line.texts["method"] == "Porzi et al."]
-    assert comparison_files.halves(lines[0], "runtime_ms") == ("-", "")
+    assert halves(lines[0], "runtime_ms") == ("-", "")
     (own,) = [line for line in tables["cityscapes"].measured if line.count == 3]
-    assert comparison_files.halves(own, "runtime_ms") == ("12.3", "(n=2)")
+    assert halves(own, "runtime_ms") == ("12.3", "(n=2)")
     made = row()
     del made["metric"]["latency.mean_ms"], made["metric"]["latency.device"]
     (line,) = compare("cityscapes", [made]).measured
-    assert comparison_files.halves(line, "runtime_ms") == ("-", "")
+    assert halves(line, "runtime_ms") == ("-", "")
     assert line.texts["device"] == "-"
 
 

@@ -7,14 +7,16 @@ from decimal import Decimal
 import pytest
 from conftest import SHARED
 
-from mtl_bench.report import comparison, formats, published
-from mtl_bench.report.tables import LITERATURE
+from mtl_bench.core.columns import FPS
+from mtl_bench.report import literature as published
+from mtl_bench.report.columns import headlines
+from mtl_bench.report.grid import PUBLISHED
 
 PAPER = SHARED / "paper/mgnet.tex"
 TABLES = published.names()
 LISTS = [
     entry
-    for entry in tomllib.loads(LITERATURE.read_text(), parse_float=Decimal)["published"]
+    for entry in tomllib.loads(PUBLISHED.read_text(), parse_float=Decimal)["published"]
     if "label" in entry
 ]
 needs_paper = pytest.mark.skipif(not PAPER.is_file(), reason="no paper")
@@ -77,7 +79,7 @@ def test_every_cell_is_as_the_paper_prints_it(name):
 @needs_paper
 @pytest.mark.parametrize("entry", LISTS, ids=lambda entry: entry["label"])
 def test_every_number_of_a_list_is_the_papers(entry):
-    metrics = [name for name in formats.PUBLISHED if name in entry["rows"][0]]
+    metrics = [c.name for c in (*headlines(), FPS) if c.name in entry["rows"][0]]
     found = [[row["name"], *(str(row[name]) for name in metrics)] for row in entry["rows"]]
     assert found == printed(entry["label"])
 
@@ -140,10 +142,10 @@ def test_every_row_has_a_source_and_known_keys(name):
 
 
 def test_mixed_protocols_are_said():
-    notes = " ".join(comparison.compare(published.load("kitti"), []).notes)
+    notes = " ".join(published.compare(published.load("kitti"), []).notes)
     assert "Published rows mix protocols." in notes
     assert "GeoNet: delta1 is as printed" in notes
-    notes = " ".join(comparison.compare(published.load("cityscapes"), []).notes)
+    notes = " ".join(published.compare(published.load("cityscapes"), []).notes)
     assert "the runtime that of the panoptic part alone" in notes
 
 

@@ -12,15 +12,15 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-import rich.console
 from fake_rows import BASELINE, GRID, failed_row, grid_rows, make_row, write_runs
 
-from mtl_bench import report
 from mtl_bench.core import config
-from mtl_bench.report import formats, page, pictures, readme
-from mtl_bench.report.groups import SMOKE
-from mtl_bench.report.notes import footnotes
-from mtl_bench.report.tables import tabulate
+from mtl_bench.report import grid as report
+from mtl_bench.report import pictures, protocol, readme
+from mtl_bench.report import table as formats
+from mtl_bench.report.columns import column, figures
+from mtl_bench.report.grid import fill, footnotes, tabulate
+from mtl_bench.report.statistics import SMOKE
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,11 @@ def built(tmp_path_factory):
     return SimpleNamespace(grid=grid, rows=rows, runs=runs, out=out)
 
 
+def spelled(entry, column, seeds):
+    """A number as Markdown has it."""
+    return " ".join(filter(None, formats.halves(entry, column, seeds)))
+
+
 # --- what is in the table -------------------------------------------------------------------------
 
 
@@ -45,13 +50,13 @@ def test_mean_and_sample_deviation_over_seeds():
     assert [group.identity for group in table.groups] == [("resnet18",), ("tiny_one",)]
     pq = table.groups[0].entries["pq"]
     assert (pq.mean, pq.std, pq.count) == pytest.approx((37.0, 1.0, 3))
-    assert formats.entry(pq, formats.BY_NAME["pq"], 3) == "37.0 \u00b1 1.0"
+    assert spelled(pq, column("pq"), 3) == "37.0 \u00b1 1.0"
 
 
 def test_one_seed_has_no_spread_and_nothing_is_bold():
     table = tabulate([make_row(metric={"panoptic.pq": 90.0}), *grid_rows()[3:]])
     pq = table.groups[0].entries["pq"]
-    assert formats.entry(pq, formats.BY_NAME["pq"], 1) == "90.0"
+    assert spelled(pq, column("pq"), 1) == "90.0"
     assert not any(e.bold for g in table.groups for e in g.entries.values())
     assert any(note.startswith("n = 1:") for note in footnotes(table))
 
@@ -90,7 +95,7 @@ def test_stale_rows_have_a_line_of_their_own_and_do_not_lead():
     rows = grid_rows()
     rows[0] = {**rows[0], "status": "stale", "error": "harness changed"}
     stale, fresh, _ = tabulate(rows).groups
-    assert (stale.names, stale.rows) == (("resnet18 (stale)",), (rows[0],))
+    assert (stale.identity, stale.mark, stale.rows) == (("resnet18",), "stale", (rows[0],))
     assert fresh.entries["pq"].mean == pytest.approx(37.5)
     assert not any(e.bold for e in stale.entries.values())
     assert any("harness changed" in note for note in footnotes(tabulate(rows)))
@@ -109,9 +114,7 @@ def test_a_value_that_some_seeds_lack_says_its_n():
     rows = [make_row(seed=seed) for seed in range(3)]
     del rows[1]["metric"]["depth_dgc.rmse"]
     table = tabulate(rows)
-    assert formats.entry(table.groups[0].entries["rmse_dgc"], formats.BY_NAME["rmse_dgc"], 3) == (
-        "9.50 (n=2)"
-    )
+    assert spelled(table.groups[0].entries["rmse_dgc"], column("rmse_dgc"), 3) == ("9.50 (n=2)")
     assert any("its own n" in note for note in footnotes(table))
 
 
@@ -120,7 +123,7 @@ def test_a_single_task_row_has_dashes():
     del rows[1]["metric"]["panoptic.pq"]
     table = tabulate(rows)
     assert table.axes == ("backbone", "tasks")
-    assert "| b | depth | 1 | - |" in formats.markdown(table)
+    assert "| b | depth | 1 | - |" in formats.markdown(fill(table))
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -191,9 +194,9 @@ def test_the_same_rows_give_the_same_bytes(built, tmp_path):
 
 
 def test_all_files_are_there_and_small(built):
-    figures = {f"{stem}.{kind}" for stem in report.FIGURES for kind in ("png", "svg")}
-    expected = {"index.html", "table.csv", "table.md", "readme.md", "table.tex", *figures}
-    expected -= {"samples.svg", "extremes.svg"}
+    drawn = {f"{stem}.{kind}" for stem in figures() for kind in ("png", "svg")}
+    expected = {"index.html", "table.csv", "table.md", "readme.md", "table.tex", *drawn}
+    expected -= {"samples.svg", "extremes.svg", "rmse_classes.svg", "rmse_classes.png"}
     assert {path.name for path in built.out.iterdir()} == expected
     assert sum(path.stat().st_size for path in built.out.iterdir()) < 6e5
     for path in built.out.glob("*.png"):
@@ -274,14 +277,17 @@ def test_page_says_how_the_numbers_were_made(built):
     assert "mtl-bench ablate --grid backbones" in text
     for words in ("depth_range_m", "0.001, 80", "center_threshold", "strides", "A CPU"):
         assert words in text
-    sections = dict(page.protocol(tabulate(built.rows)))
+    sections = dict(
+        protocol.of_cells([row for group in tabulate(built.rows).groups for row in group.rows])
+    )
     assert ("seed", "0 | 1 | 2", True) in sections["Cells"]
     assert ("split", "val", False) in sections["Evaluation"]
     assert ("strides", "8, 16, 32", False) in sections["Network"]
 
 
 def test_scaling_failures_are_counted(built):
-    counted = dict(page._counted(tabulate(built.rows)))
+    section = report.counted_images(tabulate(built.rows))
+    counted = {line.cells[0].text: [cell.text for cell in line.cells[1:]] for line in section.lines}
     assert counted["resnet18"] == ["3", "6"]  # 1 and 2 in each of three seeds
 
 
@@ -316,15 +322,7 @@ def test_worst_and_best_frames_with_their_quality(tmp_path):
     assert pictures.draw(tabulate(rows), runs, tmp_path).startswith("Input, ground truth")
 
 
-# --- terminal and README --------------------------------------------------------------------------
-
-
-def test_summary_for_a_terminal():
-    console = rich.console.Console(width=80, record=True, file=io.StringIO())
-    console.print(report.summary_table([*grid_rows(), failed_row()]))
-    text = console.export_text()
-    for words in ("resnet18", "37.0\u00b11.0", "failed", "FPS"):
-        assert words in text
+# --- README ---------------------------------------------------------------------------
 
 
 def test_readme_takes_the_table_between_its_markers(built, tmp_path):

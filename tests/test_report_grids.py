@@ -11,12 +11,13 @@ import pytest
 from fake_rows import BASELINE, GRID, curve, grid_rows, make_row, write_runs
 from matplotlib.text import Text
 
-from mtl_bench import report
+from mtl_bench.core.columns import FPS
 from mtl_bench.evaluate.delta import delta_flat, delta_task
-from mtl_bench.report import curves, delta, formats, page, plots, style
-from mtl_bench.report.layout import Layout
-from mtl_bench.report.notes import footnotes
-from mtl_bench.report.tables import tabulate
+from mtl_bench.report import curves, delta, plots, protocol, style
+from mtl_bench.report import grid as report
+from mtl_bench.report import table as formats
+from mtl_bench.report.columns import column
+from mtl_bench.report.grid import Layout, fill, footnotes, tabulate
 
 NAMED = Layout(rows="name")
 ABLATION = {
@@ -130,8 +131,10 @@ def test_published_ablation_stands_beside_its_names_only(tmp_path):
 
 def test_a_published_list_may_lack_a_value():
     source = {"rows": [{"name": "a", "pq": 1.0}, {"name": "b", "fps": 2.0}]}
-    assert [name for name, _ in formats.published_head(source)] == ["PQ", "FPS"]
-    assert formats.published_values(source["rows"][1], source) == ["-", "2.0"]
+    source |= {"mark": "published", "source": "A paper", "note": "a note"}
+    section = report._published(source, "name")
+    assert [head.title for head in section.heads[1:]] == ["PQ \u2191", "FPS \u2191"]
+    assert [cell.text for cell in section.lines[1].cells[1:]] == ["-", "2.0"]
 
 
 # --- delta ----------------------------------------------------------------------------------------
@@ -157,9 +160,10 @@ def test_delta_against_the_row_of_the_same_seed():
     assert second["metric"]["delta.flat"] == pytest.approx(2)
     assert "delta.flat" not in rows[0]["metric"]  # copies
     for key, function in (("flat", delta_flat), ("task", delta_task)):
-        more = (delta.TASK_OF,) if key == "task" else ()
+        metrics = delta.counted(rows)
+        more = ({c.key: c.task for c in metrics},) if key == "task" else ()
         own, other = rows[0]["metric"], base[0]["metric"]
-        expected = function(own, other, delta.HIGHER_IS_BETTER, *more)
+        expected = function(own, other, {c.key: c.better > 0 for c in metrics}, *more)
         assert first["metric"][f"delta.{key}"] == expected
 
 
@@ -190,13 +194,13 @@ def test_a_row_without_the_metrics_has_no_delta():
 def test_delta_stands_in_the_table_with_its_sign_and_baseline():
     rows, base = rows_with_baseline()
     table = tabulate(delta.with_delta([*rows, *base.values()], lambda row: base[row["seed"]]))
-    markdown = formats.markdown(table)
+    markdown = formats.markdown(fill(table))
     assert "Δ flat\u00a0↓<br>% worse" in markdown
     assert "Δ task\u00a0↑<br>% better" in markdown
     (note,) = [note for note in footnotes(table) if note.startswith("Delta")]
     assert "single-task fixed on resnet18" in note
     assert [g.entries["delta_flat"].count for g in table.groups] == [2, 0]
-    assert r"$\Delta$ flat" in formats.latex(table)
+    assert r"$\Delta$ flat" in formats.latex(fill(table))
     assert not any(note.startswith("Delta") for note in footnotes(tabulate(rows)))
 
 
@@ -257,18 +261,18 @@ def test_training_cost_stands_beside_the_speed():
 
 
 def test_minus_zero_has_no_sign():
-    assert formats.number(-0.04, formats.BY_NAME["delta_flat"]) == "0.0"
+    assert formats.number(-0.04, column("delta_flat")) == "0.0"
 
 
 # --- the page -------------------------------------------------------------------------------------
 
 
 def test_pseudo_labels_are_protocol_of_the_video_stage_only():
-    with_stage = dict(page.protocol(tabulate(named_rows(), NAMED)))
+    with_stage = dict(protocol.of_cells(named_rows()))
     assert ("flip", "yes", False) in with_stage["Pseudo labels"]
     assert ("one network a task", "yes | no", True) in with_stage["Cells"]
     without = named_rows(["Multi-Task Baseline"])
-    assert "Pseudo labels" not in dict(page.protocol(tabulate(without, NAMED)))
+    assert "Pseudo labels" not in dict(protocol.of_cells(without))
 
 
 def test_quality_and_cost_are_two_tables_on_the_page(tmp_path):
@@ -378,7 +382,7 @@ def test_a_report_of_many_methods_is_small_and_whole(tmp_path):
 
 def test_speed_is_not_drawn_where_the_network_is_one(tmp_path):
     layout = Layout(rows="method")
-    assert plots.against(tabulate(methods(2), layout), "pq", "fps", tmp_path) is None
-    assert plots.against(tabulate(methods(2), layout), "pq", "rmse", tmp_path)
-    assert plots.against(tabulate(methods(1), layout), "pq", "fps", tmp_path)
-    assert plots.against(tabulate(grid_rows()), "pq", "fps", tmp_path)
+    assert plots.against(tabulate(methods(2), layout), column("pq"), FPS, tmp_path) is None
+    assert plots.against(tabulate(methods(2), layout), column("pq"), column("rmse"), tmp_path)
+    assert plots.against(tabulate(methods(1), layout), column("pq"), FPS, tmp_path)
+    assert plots.against(tabulate(grid_rows()), column("pq"), FPS, tmp_path)

@@ -12,8 +12,9 @@ import fake_rows
 import numpy as np
 import pytest
 
-from mtl_bench.report import latency, latency_files, latency_plots, pareto, readme, style
-from mtl_bench.report.latency_table import notes, tabulate, without_numbers
+from mtl_bench.report import latency, latency_plots, plots, readme, style
+from mtl_bench.report import table as formats
+from mtl_bench.report.latency import notes, tabulate, without_numbers
 
 GRID = SimpleNamespace(
     name="latency",
@@ -139,7 +140,7 @@ def test_readme_has_plain_and_the_fastest_engine_of_each_precision():
             ("openvino", "bf16", 25.0),
         )
     ]
-    lines = latency_files.readme(tabulate(rows)).splitlines()
+    lines = formats.markdown(latency.readme(tabulate(rows))).splitlines()
     shown = [line.split(" | ") for line in lines if line.startswith(("| resnet18", "| tiny_one"))]
     assert [(line[2], line[3]) for line in shown] == [
         *(("plain", "fp32"), ("eager", "fp32"), ("openvino", "bf16")),
@@ -154,7 +155,7 @@ def test_readme_names_what_is_wrong_in_one_sentence():
     ]
     rows = [fake_latency.make_row("plain"), *wrong]
     rows += [fake_latency.make_row("eager", size="64x128", status="wrong", why="elsewhere")]
-    text = latency_files.readme(tabulate(rows))
+    text = formats.markdown(latency.readme(tabulate(rows)))
     assert text.count("Wrong") == 1
     assert "- Wrong: resnet18 eager bf16, resnet18 openvino fp16 (not timed, as" in text
 
@@ -261,13 +262,13 @@ def test_published_runtimes_are_marked_with_their_gpu_and_apart(built):
 # --- figures --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stem", list(latency.FIGURES))
+@pytest.mark.parametrize("stem", list(latency.figures()))
 def test_every_figure_is_drawn_with_its_names(built, stem):
     drawing = built.text[f"{stem}.svg"]
     for word in ("384x1280", "1024x2048", "resnet18", "tiny_one", "openvino"):
         assert word in drawing, word
     assert cv2.imread(str(built.out / f"{stem}.png")).std() > 5
-    assert latency.FIGURES[stem] in built.html
+    assert latency.figures()[stem] in built.html
 
 
 def test_the_caption_says_whose_quality_and_whose_speed_it_is(built):
@@ -347,7 +348,7 @@ def slow_front(points, better):
     ],
 )
 def test_front(points, better, expected):
-    assert pareto.front(points, better) == expected
+    assert plots.front(points, better) == expected
 
 
 @pytest.mark.parametrize("better", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
@@ -355,7 +356,7 @@ def test_front_is_what_the_definition_says(better):
     rng = np.random.default_rng(0)
     for size in (1, 2, 7, 40):
         points = [tuple(map(float, p)) for p in rng.integers(0, 8, (size, 2))]
-        found = pareto.front(points, better)
+        found = plots.front(points, better)
         assert set(found) == slow_front(points, better)
         assert [points[i] for i in found] == sorted(points[i] for i in found)
 
@@ -370,7 +371,7 @@ def test_stairs_have_the_best_that_can_be_had_at_a_speed(better, heights):
         axes.plot(*zip(*points, strict=True), "o")
         axes.set_xlim(0, 5)
         axes.set_ylim(0, 9)
-        pareto.draw(axes, points, better)
+        plots.draw_front(axes, points, better)
     line = axes.lines[-1]
     xs, ys = line.get_data()
     assert line.get_drawstyle() == "steps-pre"
@@ -381,4 +382,3 @@ def test_stairs_have_the_best_that_can_be_had_at_a_speed(better, heights):
 
 def test_files_have_no_more_than_the_grid_needs(built):
     assert sum(path.stat().st_size for path in built.out.iterdir()) < 1e6
-    assert latency_files.NAMES[-1] < len(latency_files.PUBLISHED)

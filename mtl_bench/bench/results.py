@@ -27,18 +27,13 @@ from typing import Any, Literal, get_args
 
 from mtl_bench.bench.claim import claimed_by
 from mtl_bench.core import plugins, provenance
+from mtl_bench.core.columns import FPS
 from mtl_bench.core.config import Cell, from_dict, to_dict
 from mtl_bench.core.fingerprint import STAGES
+from mtl_bench.core.quality import in_brief
 
 Word = Literal["done", "stale", "failed", "interrupted", "running", "missing"]
 WORDS: tuple[Word, ...] = get_args(Word)
-HEADLINES = (  # metric, title, digits
-    ("panoptic.pq", "PQ", 1),
-    ("semantic.miou", "mIoU", 1),
-    ("depth_median.rmse", "RMSE", 2),
-    ("depth_median.abs_rel", "AbsRel", 3),
-    ("latency.fps", "FPS", 1),
-)
 TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
 ASIDE = "set-aside-"
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
@@ -195,8 +190,8 @@ def rows(
 
 def headline(metric: Mapping[str, Any]) -> str:
     """The first numbers that one wants to see of a row's metrics."""
-    known = [item for item in HEADLINES if isinstance(metric.get(item[0]), (int, float))]
-    return "  ".join(f"{title} {metric[key]:.{digits}f}" for key, title, digits in known)
+    known = [c for c in (*in_brief(), FPS) if isinstance(metric.get(c.key), (int, float))]
+    return "  ".join(f"{c.title} {metric[c.key] * c.scale:.{c.digits}f}" for c in known)
 
 
 # --- beginning and failing ------------------------------------------------------------------------

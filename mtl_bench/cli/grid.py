@@ -258,7 +258,7 @@ def _rows(grid: "Grid", runs: Path) -> list[dict[str, Any]]:
 
 
 def _write(grid: "Grid", runs: Path, reports: Path, command: str) -> Path:
-    from mtl_bench import report as reporting
+    from mtl_bench.report import grid as reporting
 
     file = trivial.file_of(grid, runs)
     baseline = json.loads(file.read_text()) if file is not None and file.is_file() else None

@@ -42,13 +42,13 @@ def write(name: str | None, choice: Choice | None, runs: Path, reports: Path, sm
     if name is None:
         raise ValueError("nothing to report: say --grid NAME or --table NAME")
     from mtl_bench.bench import results
-    from mtl_bench.report import comparison, comparison_files, published
+    from mtl_bench.report import literature
 
-    literature = published.load(name)
+    known = literature.load(name)
     rows = _stored(runs) if choice is None else results.rows(choice.load().cells, runs)
-    table = comparison.compare(literature, rows, smoke)
+    table = literature.compare(known, rows, smoke)
     folder = reports / f"tables-{name}{'-smoke' * smoke}"
-    page = comparison_files.write(table, folder, _command(name, choice, smoke))
+    page = literature.write(table, folder, _command(name, choice, smoke))
     if not table.measured:
         kind = "finished smoke cell" if smoke else "finished cell"
         typer.echo(f"no {kind} in '{runs}' belongs to table '{name}': published rows only")

@@ -223,7 +223,7 @@ def _installed(package: str) -> bool:
 
 
 def attributes(kind: str, name: str) -> dict[str, Any]:
-    """Class attributes of a plug-in's file that have a literal value, without importing it.
+    """Class attributes of a plug-in that have a literal value, without importing it.
 
     Raises:
         ValueError: an unknown or ambiguous name.
@@ -234,12 +234,42 @@ def attributes(kind: str, name: str) -> dict[str, Any]:
 @functools.cache
 def _attributes(text: bytes) -> Mapping[str, Any]:
     found: dict[str, Any] = {}
-    classes = (node for node in _parse(text).body if isinstance(node, ast.ClassDef))
-    for item in itertools.chain.from_iterable(node.body for node in classes):
+    for name, value in _assigned(text):
+        with contextlib.suppress(ValueError):  # not a literal
+            found[name] = ast.literal_eval(value)
+    return found
+
+
+def class_attributes(text: bytes, name: str) -> list[ast.expr]:
+    """What a plug-in's class assigns to a name, as it is written."""
+    return [value for other, value in _assigned(text) if other == name]
+
+
+def _assigned(text: bytes) -> Iterator[tuple[str, ast.expr]]:
+    """Names and values in the bodies of a file's classes: of those that derive from a contract, or
+    where none does directly of all."""
+    classes = [node for node in _parse(text).body if isinstance(node, ast.ClassDef)]
+    contracts = {base for _, base in BASES.values()}
+    own = [c for c in classes if {ast.unparse(b) for b in c.bases} & contracts]
+    for item in itertools.chain.from_iterable(node.body for node in own or classes):
         targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
         if isinstance(item, (ast.Assign, ast.AnnAssign)) and item.value is not None:
-            with contextlib.suppress(ValueError):  # not a literal
-                found |= {ast.unparse(t): ast.literal_eval(item.value) for t in targets if t}
+            yield from ((ast.unparse(target), item.value) for target in targets if target)
+
+
+def ordered(tasks: Iterable[str]) -> list[str]:
+    """Names of tasks, each behind those whose results it reads, else by the alphabet.
+
+    Raises:
+        ValueError: an unknown task, or tasks that wait for each other.
+    """
+    after = {name: set(attributes("tasks", name).get("after", ())) for name in sorted(tasks)}
+    found: list[str] = []
+    while len(found) < len(after):
+        ready = [n for n in after if n not in found and after[n] & after.keys() <= set(found)]
+        if not ready:
+            raise ValueError(f"tasks wait for each other: {', '.join(after.keys() - set(found))}")
+        found.append(ready[0])
     return found
 
 

@@ -281,17 +281,7 @@ def tasks_of(recipe: Recipe, names: Iterable[str], labels: LabelSet) -> tuple[Ta
     Raises:
         ValueError: an unknown task.
     """
-    kinds: dict[str, type[Task]] = {n: plugins.load("tasks", n) for n in sorted(names)}
-    ordered: dict[str, Task] = {}
-    while len(ordered) < len(kinds):
-        for name, kind in kinds.items():
-            ready = ordered.keys() >= kinds.keys() & set(kind.after)
-            if name not in ordered and ready:
-                ordered[name] = kind(recipe, labels)
-                break
-        else:
-            raise ValueError(f"tasks wait for each other: {', '.join(kinds.keys() - ordered)}")
-    return tuple(ordered.values())
+    return tuple(plugins.load("tasks", n)(recipe, labels) for n in plugins.ordered(names))
 
 
 def tasks_of_cell(cell: Cell) -> tuple[Task, ...]:

@@ -1,56 +1,85 @@
-"""The measured quantities that a table shows: where a row has them and how they are written."""
+"""The columns of a grid's table: the tasks' metrics, deltas and cost; and the values of rows."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from itertools import combinations
 from typing import Any
+
+from mtl_bench.core import quality
+from mtl_bench.core.columns import FPS, Column
 
 Row = Mapping[str, Any]
 
-
-@dataclass(frozen=True)
-class Column:
-    """One measured quantity: where a row has it and how it is shown."""
-
-    name: str  # in table.csv
-    title: str
-    key: str  # dotted key of a row; of a column relative to the reference: the other column's name
-    better: int  # +1: higher, -1: lower
-    digits: int
-    scale: float = 1.0
-    part: str = "quality"  # quality | cost
-    note: str = ""  # said under the title
-
-
-COLUMNS = (
-    Column("pq", "PQ", "panoptic.pq", +1, 1, note="%"),
-    Column("pq_things", "PQ things", "panoptic.pq_things", +1, 1, note="%"),
-    Column("pq_stuff", "PQ stuff", "panoptic.pq_stuff", +1, 1, note="%"),
-    Column("miou", "mIoU", "semantic.miou", +1, 1, note="%"),
-    Column("abs_rel", "AbsRel", "depth_median.abs_rel", -1, 3, note="median-scaled"),
-    Column("rmse", "RMSE", "depth_median.rmse", -1, 2, note="m, median-scaled"),
-    Column("delta1", "delta1", "depth_median.delta1", +1, 3, note="median-scaled"),
-    Column("rmse_dgc", "RMSE dgc", "depth_dgc.rmse", -1, 2, note="m, dgc-scaled"),
-    Column("delta_flat", "\u0394 flat", "delta.flat", -1, 1, note="% worse"),
-    Column("delta_task", "\u0394 task", "delta.task", +1, 1, note="% better"),
-    Column("fps", "FPS", "latency.fps", +1, 1, part="cost"),
-    Column("p50_ms", "p50", "latency.p50_ms", -1, 1, part="cost", note="ms"),
-    Column("p95_ms", "p95", "latency.p95_ms", -1, 1, part="cost", note="ms"),
-    Column("params_m", "params", "latency.params_m", -1, 2, part="cost", note="M"),
-    Column("gmacs", "GMACs", "latency.gmacs", -1, 2, part="cost"),
-    Column("peak_mib", "peak", "latency.peak_mib", -1, 1, part="cost", note="MiB"),
-    Column("train_min", "train", "time.train_s", -1, 1, 1 / 60, part="cost", note="min"),
-    Column("step_ms", "step", "time.step_ms", -1, 1, part="cost", note="ms"),
-    Column("train_peak_mib", "train peak", "time.peak_mib", -1, 1, part="cost", note="MiB"),
+DELTA = (  # of a baseline whose own is 0
+    Column("delta_flat", "delta.flat", "\u0394 flat", -1, 1, "% worse"),
+    Column("delta_task", "delta.task", "\u0394 task", +1, 1, "% better", short=True),
 )
-BY_NAME = {column.name: column for column in COLUMNS}
-RELATIVE = (  # to the reference group's mean
-    Column("step_x", "step", "step_ms", -1, 2, part="cost"),
-    Column("train_peak_x", "train peak", "train_peak_mib", -1, 2, part="cost"),
+COST = (
+    FPS,
+    Column("p50_ms", "latency.p50_ms", "p50", -1, 1, "ms", part="cost"),
+    Column("p95_ms", "latency.p95_ms", "p95", -1, 1, "ms", part="cost"),
+    Column("params_m", "latency.params_m", "params", -1, 2, "M", part="cost", short=True),
+    Column("gmacs", "latency.gmacs", "GMACs", -1, 2, part="cost"),
+    Column("peak_mib", "latency.peak_mib", "peak", -1, 1, "MiB", part="cost"),
+    Column("train_min", "time.train_s", "train", -1, 1, "min", scale=1 / 60, part="cost"),
+    Column("step_ms", "time.step_ms", "step", -1, 1, "ms", part="cost"),
+    Column("train_peak_mib", "time.peak_mib", "train peak", -1, 1, "MiB", part="cost"),
+)
+RELATIVE = (  # to the reference group's mean; the key is the other column's name
+    Column("step_x", "step_ms", "step", -1, 2, part="cost"),
+    Column("train_peak_x", "train_peak_mib", "train peak", -1, 2, part="cost"),
 )
 ONLY = {  # what a grid that is about one thing shows
     "cost": ("step_ms", "step_x", "train_peak_mib", "train_peak_x"),
 }
+
+
+def columns() -> tuple[Column, ...]:
+    """All but the relative ones, in the table's order."""
+    return (*quality.quality(), *DELTA, *COST)
+
+
+def column(name: str) -> Column:
+    return next(c for c in (*columns(), *RELATIVE) if c.name == name)
+
+
+def headlines() -> list[Column]:
+    """The metrics that are plotted, without the speed."""
+    return [column for column in quality.quality() if column.headline]
+
+
+def pairs() -> list[tuple[Column, Column]]:
+    """What is plotted against what: (y, x)."""
+    return [*((y, FPS) for y in headlines()), *combinations(headlines(), 2)]
+
+
+def against(y: Column, x: Column) -> str:
+    return capital(f"{y.in_words} against {x.in_words}")
+
+
+def capital(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def per_class() -> dict[str, Column]:
+    """Stem of a figure per class -> its metric: `classes` is the first headline's."""
+    return {f"{c.name}_classes" if i else "classes": c for i, c in enumerate(headlines())}
+
+
+def figures() -> dict[str, str]:
+    """Stems of the figures that a grid's report may have -> their headings, in the page's order."""
+    return {
+        **{f"{y.name}_{x.name}": against(y, x) for y, x in pairs()},
+        "samples": "Sample predictions",
+        "extremes": "Worst and best frame of each row",
+        **{stem: capital(f"{c.in_words} per class") for stem, c in per_class().items()},
+        "loss_curves": "Training curves",
+        "weight_curves": "Learned weights",
+        "diagnostics": "Update norm and gradient cosines",
+    }
+
+
+# --- values ---------------------------------------------------------------------------------------
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -70,3 +99,19 @@ def measured(row: Row, column: Column) -> float:
     if value is None:
         value = flatten(row).get(column.key)
     return math.nan if value is None else float(value) * column.scale
+
+
+def text(value: Any) -> str:
+    """A setting as a reader writes it."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(text(item) for item in value) or "none"
+    if isinstance(value, float):
+        return f"{value:g}"
+    return "none" if value is None else str(value)
+
+
+def different(values: Iterable[Any]) -> list[str]:
+    """Values as text, each once."""
+    return list(dict.fromkeys(map(text, values)))

@@ -6,7 +6,7 @@ A cell of `curve.csv` may be empty: a batch without a task's labels, or a step w
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -14,10 +14,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from mtl_bench.report.formats import sentence
+from mtl_bench.report.columns import capital
 from mtl_bench.report.plots import heat_table, looks_of, watermark
 from mtl_bench.report.style import MANY, Look, save, styled
-from mtl_bench.report.tables import Table
+from mtl_bench.report.table import NOTHING
+
+if TYPE_CHECKING:
+    from mtl_bench.report.grid import Results
 
 POINTS, POINTS_OF_MANY = 60, 20  # per curve: longer ones are averaged
 PANEL = (2.9, 2.1)  # inches
@@ -25,7 +28,7 @@ COSINE = "cosine."
 Curves = Mapping[str, Sequence[pd.DataFrame]]  # group label -> one frame per seed
 
 
-def terms(table: Table, runs: Curves, prefix: str, out_dir: Path) -> str | None:
+def terms(results: "Results", runs: Curves, prefix: str, out_dir: Path) -> str | None:
     """`<prefix>_curves`: one panel per loss term over the training steps, one line per group.
 
     Args:
@@ -41,12 +44,12 @@ def terms(table: Table, runs: Curves, prefix: str, out_dir: Path) -> str | None:
     constant = all(f[c].nunique() < 2 for c in panels for f in frames if c in f)
     if not panels or (prefix == "weight" and constant):
         return None
-    _draw(table, runs, panels, out_dir, f"{prefix}_curves")
+    _draw(results, runs, panels, out_dir, f"{prefix}_curves")
     what = "Unweighted training loss" if prefix == "loss" else "Weight"
-    return f"{what} of each term over the training steps, {_how(table)}"
+    return f"{what} of each term over the training steps, {_how(results)}"
 
 
-def diagnostics(table: Table, runs: Curves, out_dir: Path) -> str | None:
+def diagnostics(results: "Results", runs: Curves, out_dir: Path) -> str | None:
     """`diagnostics`: norm of the update and cosines of the task gradients over the steps.
 
     One panel each; cosines of many groups as a table of their means, since no eye follows ten
@@ -60,12 +63,12 @@ def diagnostics(table: Table, runs: Curves, out_dir: Path) -> str | None:
     if not norm and not cosines:
         return None
     if cosines and len(runs) > MANY:
-        _cosine_table(table, runs, norm | cosines, out_dir)
+        _cosine_table(results, runs, norm | cosines, out_dir)
         return "Means over steps and seeds: cosines between the task gradients, norm of the update."
-    _draw(table, runs, norm | cosines, out_dir, "diagnostics")
+    _draw(results, runs, norm | cosines, out_dir, "diagnostics")
     words = ["norm of the parameters' update"] * bool(norm)
     words += ["cosines between the task gradients"] * bool(cosines)
-    return f"{sentence(' and '.join(words))} over the training steps, {_how(table)}"
+    return f"{capital(' and '.join(words))} over the training steps, {_how(results)}"
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -87,29 +90,31 @@ def _pair(column: str) -> str:
     return f"cosine {first}, {second}"
 
 
-def _how(table: Table) -> str:
-    several = any(len(group.rows) > 1 for group in table.groups)
-    many = len(table.groups) > MANY
+def _how(results: "Results") -> str:
+    several = any(len(group.rows) > 1 for group in results.groups)
+    many = len(results.groups) > MANY
     words = "mean over seeds." if many else "mean over seeds with their range."
-    stage = any(row.get("cell", {}).get("video") for group in table.groups for row in group.rows)
+    stage = any(row.get("cell", {}).get("video") for group in results.groups for row in group.rows)
     return (words if several else "one seed each.") + (
         " The video stage counts its own steps." if stage else ""
     )
 
 
-def _cosine_table(table: Table, runs: Curves, columns: Mapping[str, str], out_dir: Path) -> None:
+def _cosine_table(
+    results: "Results", runs: Curves, columns: Mapping[str, str], out_dir: Path
+) -> None:
     """A row per group, a column per pair, and the norm of the update without a colour."""
-    labels = [group.label for group in table.groups if group.label in runs]
+    labels = [group.label for group in results.groups if group.label in runs]
     means = np.array([[_mean(runs[label], column) for column in columns] for label in labels])
     cosine = np.array([column.startswith(COSINE) for column in columns])
     spell = ["{:z.2f}" if is_cosine else "{:.2g}" for is_cosine in cosine]
     texts = [
-        ["-" if math.isnan(v) else s.format(v) for v, s in zip(line, spell, strict=True)]
+        [NOTHING if math.isnan(v) else s.format(v) for v, s in zip(line, spell, strict=True)]
         for line in means
     ]
     heat = np.where(cosine, means, math.nan)
     titles = (labels, list(columns.values()))
-    heat_table(table, titles, heat, texts, ("RdBu", -1, 1, "mean cosine"), out_dir, "diagnostics")
+    heat_table(results, titles, heat, texts, ("RdBu", -1, 1, "mean cosine"), out_dir, "diagnostics")
 
 
 def _mean(frames: Sequence[pd.DataFrame], column: str) -> float:
@@ -117,7 +122,9 @@ def _mean(frames: Sequence[pd.DataFrame], column: str) -> float:
     return float(np.mean(means)) if means else math.nan
 
 
-def _draw(table: Table, runs: Curves, panels: Mapping[str, str], out_dir: Path, name: str) -> None:
+def _draw(
+    results: "Results", runs: Curves, panels: Mapping[str, str], out_dir: Path, name: str
+) -> None:
     """One panel per column; the legend stands in the last one, or below where it is long.
 
     Args:
@@ -134,7 +141,7 @@ def _draw(table: Table, runs: Curves, panels: Mapping[str, str], out_dir: Path, 
         all_axes = figure.subplots(down, across, squeeze=False).flatten()
         handles: dict[str, Any] = {}
         for axes, (column, title) in zip(all_axes, panels.items(), strict=False):
-            for group, look in looks_of(table):
+            for group, look in looks_of(results):
                 several = [f for f in runs.get(group.label, ()) if _has(f, column)]
                 if several:
                     line = _curve(axes, several, column, look, group.status == "stale", many)
@@ -142,7 +149,7 @@ def _draw(table: Table, runs: Curves, panels: Mapping[str, str], out_dir: Path, 
             axes.set_title(title)
             axes.set_xlabel("step")
             _scale(axes, column)
-            watermark(axes, table)
+            watermark(axes, results)
         for axes in all_axes[len(panels) :]:
             axes.set_axis_off()
         if many:

@@ -7,18 +7,21 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from mtl_bench.core import quality
+from mtl_bench.core.columns import Column
 from mtl_bench.evaluate.delta import delta_flat, delta_task
 from mtl_bench.report.columns import Row
 
-METRICS = {  # key: task, whether higher is better
-    "panoptic.pq": ("panoptic", True),
-    "semantic.miou": ("panoptic", True),
-    "depth_median.abs_rel": ("depth", False),
-    "depth_median.rmse": ("depth", False),
-    "depth_median.delta1": ("depth", True),
-}
-TASK_OF = {key: task for key, (task, _) in METRICS.items()}
-HIGHER_IS_BETTER = {key: up for key, (_, up) in METRICS.items()}
+
+def counted(rows: Sequence[Row]) -> list[Column]:
+    """The metrics that count: those of the tasks that some row has a metric of.
+
+    A row must have all of them, so that all rows of a grid are judged by the same ones. A grid of
+    one task has none: there is nothing to trade.
+    """
+    metrics = [column for column in quality.quality() if column.in_delta]
+    found = {c.task for c in metrics if any(_has(row, c) for row in rows)}
+    return [column for column in metrics if column.task in found] if len(found) > 1 else []
 
 
 def with_delta(
@@ -30,32 +33,38 @@ def with_delta(
     of the two lacks a metric, where the baseline has a 0 (no change relative to it exists), and
     where only the baseline's code is older or only one of the two is a smoke run.
     """
-    return [_with_delta(row, baseline_of(row)) for row in rows]
+    metrics = counted(rows)
+    return [_with_delta(row, baseline_of(row), metrics) for row in rows]
 
 
-def _with_delta(row: Row, baseline: Row | None) -> dict[str, Any]:
-    if baseline is None or not _comparable(row, baseline):
+def _with_delta(row: Row, baseline: Row | None, metrics: Sequence[Column]) -> dict[str, Any]:
+    if baseline is None or not metrics or not _comparable(row, baseline, metrics):
         return dict(row)
     own, base = row["metric"], baseline["metric"]
+    upward = {column.key: column.better > 0 for column in metrics}
     delta = {
-        "delta.flat": delta_flat(own, base, HIGHER_IS_BETTER),
-        "delta.task": delta_task(own, base, HIGHER_IS_BETTER, TASK_OF),
+        "delta.flat": delta_flat(own, base, upward),
+        "delta.task": delta_task(own, base, upward, {c.key: c.task for c in metrics}),
     }
-    return {**row, "metric": {**own, **delta}, "delta_baseline": _words(baseline)}
+    return {**row, "metric": {**own, **delta}, "delta_baseline": _named(baseline)}
 
 
-def _comparable(row: Row, baseline: Row) -> bool:
-    own, base = row.get("metric", {}), baseline.get("metric", {})
+def _has(row: Row, column: Column) -> bool:
+    return math.isfinite(row.get("metric", {}).get(column.key, math.nan))
+
+
+def _comparable(row: Row, baseline: Row, metrics: Sequence[Column]) -> bool:
+    base = baseline.get("metric", {})
     return (
         row["slug"] != baseline["slug"]
         and baseline.get("status", "done") in ("done", row.get("status", "done"))
         and bool(row.get("smoke")) == bool(baseline.get("smoke"))
-        and all(math.isfinite(own.get(key, math.nan)) for key in METRICS)
-        and all(math.isfinite(base.get(key, math.nan)) and base[key] != 0 for key in METRICS)
+        and all(_has(row, column) and _has(baseline, column) for column in metrics)
+        and all(base[column.key] != 0 for column in metrics)
     )
 
 
-def _words(baseline: Row) -> str:
+def _named(baseline: Row) -> str:
     """The baseline as a footnote names it."""
     kind = "single-task " if baseline.get("cell", {}).get("single_task") else ""
     return f"{kind}{baseline.get('method')} on {baseline.get('backbone')}"

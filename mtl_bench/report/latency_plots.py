@@ -6,7 +6,7 @@ Colour is the backbone, marker the engine, filling the precision: the same in ev
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,11 +15,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from mtl_bench.core.config import TASKS
-from mtl_bench.report import pareto
-from mtl_bench.report.groups import SMOKE
-from mtl_bench.report.latency_table import LatencyTable, Line
+from mtl_bench.core.columns import FPS, Column
+from mtl_bench.report.plots import better, draw_front
+from mtl_bench.report.statistics import SMOKE
 from mtl_bench.report.style import GRAY, MARKERS, looks, save, styled
+
+if TYPE_CHECKING:
+    from mtl_bench.report.latency import Line, Timings
 
 FILLS = {"fp32": "full", "bf16": "left", "fp16": "none"}
 STAGES = (
@@ -27,52 +29,49 @@ STAGES = (
     ("network_ms", "network"),
     ("postprocess_ms", "post-processing"),
 )
-QUALITIES = {"pq": ("PQ, % (higher is better)", +1), "rmse": ("RMSE, m (lower is better)", -1)}
 BAR = 0.19  # inches
 NEAR = 1.4  # times as high a roof is so near that words do not fit between
 
 
-def against_quality(table: LatencyTable, name: str, out_dir: Path) -> str | None:
-    """`<name>_fps`: a backbone's quality against each engine's speed, and the Pareto front.
-
-    Args:
-        name: pq | rmse.
+def against_quality(timings: "Timings", column: Column, out_dir: Path) -> str | None:
+    """`<column>_fps`: a backbone's quality against each engine's speed, and the Pareto front.
 
     Returns:
         What the figure shows in words, or None where no timing with all tasks has a quality.
     """
-    values = {quality.backbone: getattr(quality, name) for quality in table.quality}
-    lines = [li for li in _whole(table) if li.row["backbone"] in values]
+    every = {quality.backbone: quality.values[column.name] for quality in timings.quality}
+    values = {backbone: value for backbone, value in every.items() if not math.isnan(value)}
+    lines = [li for li in timings.whole if li.row["backbone"] in values]
     if not lines:
         return None
-    title, better = QUALITIES[name]
     with styled():
-        figure, panels = _panels(table, lines)
+        figure, panels = _panels(timings, lines)
         fronts = [
-            [(line.values["fps"], values[line.row["backbone"]]) for line in own]
+            [(line.values[FPS.name], values[line.row["backbone"]]) for line in own]
             for _, own in panels
         ]
         for (axes, own), points in zip(panels, fronts, strict=True):
             for line, point in zip(own, points, strict=True):
-                axes.plot(*point, linestyle="", **_marker(table, line))
-            _plain_log(axes, "FPS (higher is better)")
+                axes.plot(*point, linestyle="", **_marker(timings, line))
+            _plain_log(axes, f"{FPS.title} ({better(FPS)} is better)")
             axes.margins(0.12)
         for (axes, _), points in zip(panels, fronts, strict=True):  # they share the y axis
-            pareto.draw(axes, points, better)
-        panels[0][0].set_ylabel(title)
-        _legend(figure, table, lines, [Line2D([], [], color=GRAY, label="Pareto front")])
-        save(figure, out_dir, f"{name}_fps")
-    return f"{title.partition(',')[0]} over frames per second, all tasks. {_where_from(table)}"
+            draw_front(axes, points, column.better)
+        title = ", ".join(filter(None, (column.title, column.unit)))
+        panels[0][0].set_ylabel(f"{title} ({better(column)} is better)")
+        _legend(figure, timings, lines, [Line2D([], [], color=GRAY, label="Pareto front")])
+        save(figure, out_dir, f"{column.name}_{FPS.name}")
+    return f"{column.title} over {FPS.in_words}, all tasks. {_where_from(timings)}"
 
 
-def stages(table: LatencyTable, out_dir: Path) -> str | None:
+def stages(timings: "Timings", out_dir: Path) -> str | None:
     """`stages`: where a frame's time goes, a bar for each timing."""
-    lines = _whole(table) or table.measured
+    lines = timings.whole
     if not lines:
         return None
     shades = ("#9ecae1", "#0072B2", "#D55E00")
     with styled():
-        figure, panels = _panels(table, lines, BAR)
+        figure, panels = _panels(timings, lines, BAR)
         for axes, own in panels:
             left = np.zeros(len(own))
             for (key, _), color in zip(STAGES, shades, strict=True):
@@ -97,22 +96,22 @@ def stages(table: LatencyTable, out_dir: Path) -> str | None:
     return f"Mean time of each stage of a frame, {tasks}, batch 1; the number is their sum in ms."
 
 
-def roofline(table: LatencyTable, out_dir: Path) -> str | None:
+def roofline(timings: "Timings", out_dir: Path) -> str | None:
     """`roofline`: the network's arithmetic a second against what the machine can do at most."""
-    lines = [line for line in _whole(table) or table.measured if _has_roof(line)]
+    lines = [line for line in timings.whole if _has_roof(line)]
     if not lines:
         return None
     with styled():
-        figure, panels = _panels(table, lines)
+        figure, panels = _panels(timings, lines)
         for axes, own in panels:
             points = [_work(line) for line in own]
             for line, point in zip(own, points, strict=True):
-                axes.plot(*point, linestyle="", **_marker(table, line))
+                axes.plot(*point, linestyle="", **_marker(timings, line))
             _roofs(axes, own, [x for x, _ in points])
             axes.set_yscale("log")
             _plain_log(axes, "operations a byte")
         panels[0][0].set_ylabel("GFLOP/s of the network")
-        _legend(figure, table, lines, [])
+        _legend(figure, timings, lines, [])
         save(figure, out_dir, "roofline")
     best = max(lines, key=lambda line: line.values["roofline"])
     metric = best.row["metric"]
@@ -129,20 +128,15 @@ def roofline(table: LatencyTable, out_dir: Path) -> str | None:
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _whole(table: LatencyTable) -> list[Line]:
-    """The timings with numbers and all tasks: what a cell of all tasks has the quality of."""
-    return [line for line in table.measured if set(line.row["tasks"]) == set(TASKS)]
-
-
 def _panels(
-    table: LatencyTable, lines: Sequence[Line], bar: float = 0.0
-) -> tuple[Figure, list[tuple[Axes, list[Line]]]]:
+    timings: "Timings", lines: Sequence["Line"], bar: float = 0.0
+) -> tuple[Figure, list[tuple[Axes, list["Line"]]]]:
     """Axes for each size that has lines, side by side.
 
     Args:
         bar: height of a line's bar, inches; then the panels stand below each other.
     """
-    groups = {size: [line for line in lines if line.size == size] for size in table.sizes}
+    groups = {size: [line for line in lines if line.size == size] for size in timings.sizes}
     groups = {size: own for size, own in groups.items() if own}
     count = len(groups)
     if bar:
@@ -155,14 +149,14 @@ def _panels(
         found = figure.subplots(1, count, squeeze=False, sharey=True)[0]
     for axes, size in zip(found, groups, strict=True):
         axes.set_title(size)
-    if table.smoke:
+    if timings.smoke:
         figure.suptitle(SMOKE, color="#a40000")
     return figure, list(zip(found, groups.values(), strict=True))
 
 
-def _marker(table: LatencyTable, line: Line) -> dict[str, Any]:
-    engines = dict.fromkeys(li.engine for li in table.lines)
-    look = looks(dict.fromkeys(li.names[0] for li in table.lines))[line.names[0]]
+def _marker(timings: "Timings", line: "Line") -> dict[str, Any]:
+    engines = dict.fromkeys(li.engine for li in timings.lines)
+    look = looks(dict.fromkeys(li.names[0] for li in timings.lines))[line.names[0]]
     return {
         "marker": MARKERS[list(engines).index(line.engine) % len(MARKERS)],
         "color": look.color,
@@ -174,14 +168,14 @@ def _marker(table: LatencyTable, line: Line) -> dict[str, Any]:
 
 
 def _legend(
-    figure: Figure, table: LatencyTable, lines: Sequence[Line], more: Sequence[Line2D]
+    figure: Figure, timings: "Timings", lines: Sequence["Line"], more: Sequence[Line2D]
 ) -> None:
     """What colour, marker and filling say, as far as the lines have them."""
     handles: list[Any] = []
     for place in (0, 2, 3):  # backbone, engine, precision
         for name in dict.fromkeys(line.names[place] for line in lines):
             line = next(li for li in lines if li.names[place] == name)
-            shown = _marker(table, line)
+            shown = _marker(timings, line)
             shown |= {0: {"marker": "o"}, 2: {}, 3: {"marker": "h"}}[place]
             shown |= {"color": GRAY} if place else {}
             shown |= {"fillstyle": "full"} if place != 3 else {}
@@ -198,15 +192,15 @@ def _plain_log(axes: Axes, label: str) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _where_from(table: LatencyTable) -> str:
+def _where_from(timings: "Timings") -> str:
     """Of which networks quality and speed are: not the same ones, and the reader must know."""
-    recipes = {(q.recipe["name"], q.size, q.recipe["network"]["channels"]) for q in table.quality}
+    recipes = {(q.recipe["name"], q.size, q.recipe["network"]["channels"]) for q in timings.quality}
     named = "; ".join(
         f"recipe {name} ({size} images, decoders of {channels} channels)"
         for name, size, channels in sorted(recipes)
     )
-    seeds = sorted({quality.seeds for quality in table.quality})
-    timed = " or ".join(dict.fromkeys(str(li.row["timing"]["recipe"]) for li in table.measured))
+    seeds = sorted({quality.seeds for quality in timings.quality})
+    timed = " or ".join(dict.fromkeys(str(li.row["timing"]["recipe"]) for li in timings.measured))
     return (
         f"Quality is measured at the training recipe's size: {named}, n = "
         f"{' or '.join(map(str, seeds))}; speed is measured at the deployed size above each panel, "
@@ -215,20 +209,20 @@ def _where_from(table: LatencyTable) -> str:
     )
 
 
-def _has_roof(line: Line) -> bool:
+def _has_roof(line: "Line") -> bool:
     metric = line.row["metric"]
     needed = ("latency.gmacs", "latency.network_mb", "roofline.peak_gflops", "roofline.peak_gbs")
     return all(metric.get(key) for key in needed) and not math.isnan(line.values["roofline"])
 
 
-def _work(line: Line) -> tuple[float, float]:
+def _work(line: "Line") -> tuple[float, float]:
     """Operations a byte, and GFLOP/s."""
     metric = line.row["metric"]
     gflop = 2 * metric["latency.gmacs"]
     return gflop * 1000 / metric["latency.network_mb"], gflop * 1000 / line.values["network_ms"]
 
 
-def _roofs(axes: Axes, lines: Sequence[Line], intensities: Sequence[float]) -> None:
+def _roofs(axes: Axes, lines: Sequence["Line"], intensities: Sequence[float]) -> None:
     """One roof for each precision: the highest peaks that any of its timings measured."""
     roofs: dict[tuple[float, ...], list[str]] = {}
     for precision in dict.fromkeys(line.names[3] for line in lines):

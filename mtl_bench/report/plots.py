@@ -1,10 +1,13 @@
-"""The report's figures of what was measured: one column against another, quality per class."""
+"""The report's figures of what was measured: one column against another, a column per class.
+
+A Pareto front has the points that no other point beats in both of two numbers.
+"""
 
 import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -13,82 +16,86 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from mtl_bench.core.labels import LabelSet
-from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.report.columns import BY_NAME, Column
-from mtl_bench.report.groups import SMOKE, Group
+from mtl_bench.core.columns import FPS, Column
+from mtl_bench.report import facts
+from mtl_bench.report.columns import capital
+from mtl_bench.report.statistics import SMOKE, Group
 from mtl_bench.report.style import BASELINE, GRAY, MANY, Look, looks, save, styled
-from mtl_bench.report.tables import Table
+from mtl_bench.report.table import NOTHING, number
+
+if TYPE_CHECKING:
+    from mtl_bench.report.grid import Results
 
 RINGS = (10, 14, 20, 27, 35, 45, 57, 70)  # distances of a number from its point, in points
 ANGLES = [math.radians(a) for a in range(45, 405, 30)]
 ROOM = 9.5  # around a number, in points
-CLASS = re.compile(r"panoptic\.class\.(.+)\.pq")
+Point = tuple[float, float]
 
 
-def against(table: Table, y: str, x: str, out_dir: Path) -> str | None:
+def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | None:
     """`<y>_<x>`: two columns against each other, one marker per group with its spread.
 
     Returns:
         What the figure shows in words, or None where no group has both numbers, or where the
         differences in speed are noise, since all groups have the same network.
     """
-    groups = [g for g in table.groups if g.entries[y].count and g.entries[x].count]
+    groups = [g for g in results.groups if g.entries[y.name].count and g.entries[x.name].count]
     sizes = {group.entries["params_m"].mean for group in groups}
-    if not groups or (x == "fps" and len(groups) > 1 and len(sizes) == 1):
+    if not groups or (x == FPS and len(groups) > 1 and len(sizes) == 1):
         return None
-    down, across = BY_NAME[y], BY_NAME[x]
     many = len(groups) > MANY
     with styled():
         figure = Figure(figsize=(9.2, 4.8) if many else (6.4, 3.6), layout="constrained")
         axes = figure.add_subplot()
         handles: list[Any] = []
         spots = {}
-        for number, (group, look) in enumerate(looks_of(table), 1):
+        for index, (group, look) in enumerate(looks_of(results), 1):
             if group in groups:
-                spots[number] = (group.entries[x].mean, group.entries[y].mean)
-                _point(axes, group, across, down, look)
-                label = f"{number} " * many + f"{group.label} (n={len(group.rows)})"
+                spots[index] = (group.entries[x.name].mean, group.entries[y.name].mean)
+                _point(axes, group, x, y, look)
+                label = f"{index} " * many + f"{group.label} (n={len(group.rows)})"
                 handles.append(Line2D([], [], linestyle="", label=label, **_marker(group, look)))
-        if x == "fps" and table.baseline and table.baseline.entries[y].count:
-            level = table.baseline.entries[y].mean
+        if x == FPS and results.baseline and results.baseline.entries[y.name].count:
+            level = results.baseline.entries[y.name].mean
             handles.append(axes.axhline(level, label="trivial predictor", **BASELINE))
-        where = f"\n{_where_timed(groups)}" if x == "fps" else ""
-        axes.set_xlabel(f"{_with_unit(across)} ({_better(across)} is better){where}")
-        axes.set_ylabel(f"{_with_unit(down)}\n({_better(down)} is better)")
+        where = f"\n{_where_timed(groups)}" if x == FPS else ""
+        axes.set_xlabel(f"{with_unit(x)} ({better(x)} is better){where}")
+        axes.set_ylabel(f"{with_unit(y)}\n({better(y)} is better)")
         axes.margins(0.12)
-        watermark(axes, table)
+        watermark(axes, results)
         style: dict[str, Any] = {"ncols": 2, "fontsize": 7.5, "columnspacing": 1} if many else {}
         figure.legend(handles=handles, loc="outside right upper", **style)
         if many:
             _number(axes, spots)
-        save(figure, out_dir, f"{y}_{x}")
+        save(figure, out_dir, f"{y.name}_{x.name}")
     if many:
-        return f"{down.title} against {across.title}; the numbers are those of the legend."
-    points = "; ".join(
-        f"{g.label} {_short(g, down)} at {_short(g, across)} {across.title}" for g in groups
-    )
-    return f"{down.title} against {across.title}. {points}."
+        return f"{y.title} against {x.title}; the numbers are those of the legend."
+    points = "; ".join(f"{g.label} {_short(g, y)} at {_short(g, x)} {x.title}" for g in groups)
+    return f"{y.title} against {x.title}. {points}."
 
 
-def classes(table: Table, out_dir: Path, labels: LabelSet = CITYSCAPES20) -> str | None:
-    """`classes`: panoptic quality per class and group as a heat table."""
-    values = {group.label: _class_quality(group) for group in table.groups}
+def classes(results: "Results", column: Column, out_dir: Path, name: str) -> str | None:
+    """A column per class and group as a heat table.
+
+    Its classes are where its key has them: `<task>.class.<name>.<metric>`.
+    """
+    values = {group.label: _per_class(group, column) for group in results.groups}
     values = {label: quality for label, quality in values.items() if quality}
-    found = {name for quality in values.values() for name in quality}
-    names = [label.name for label in labels.labels if label.name in found]
-    if not names:
+    found = dict.fromkeys(name for quality in values.values() for name in quality)
+    if not found:
         return None
+    names = sorted(found, key=lambda n: facts.CLASSES.index(n) if n in facts.CLASSES else math.inf)
     heat = np.array([[quality.get(n, math.nan) for n in names] for quality in values.values()])
-    texts = [["-" if math.isnan(v) else f"{v:.0f}" for v in line] for line in heat]
-    heat_table(
-        table, (list(values), names), heat, texts, ("Blues", 0, 100, "PQ, %"), out_dir, "classes"
-    )
-    return "Panoptic quality per class, mean over seeds; only classes that occur in the split."
+    texts = [[NOTHING if math.isnan(v) else f"{v:.0f}" for v in line] for line in heat]
+    high = 100 if column.unit == "%" else float(np.nanmax(heat))
+    scale = ("Blues", 0.0, high, with_unit(column))
+    heat_table(results, (list(values), names), heat, texts, scale, out_dir, name)
+    what = capital(column.in_words)
+    return f"{what} per class, mean over seeds; only classes that occur in the split."
 
 
 def heat_table(
-    table: Table,
+    results: "Results",
     titles: tuple[Sequence[str], Sequence[str]],
     heat: NDArray[np.floating],
     texts: Sequence[Sequence[str]],
@@ -121,7 +128,7 @@ def heat_table(
             color = "white" if dark else "black"
             axes.text(x, y, texts[y][x], ha="center", va="center", color=color, fontsize=8)
         figure.colorbar(image, ax=axes, label=what, pad=0.01, fraction=0.03)
-        if table.smoke:
+        if results.smoke:
             axes.set_title(SMOKE, color="#a40000")
         save(figure, out_dir, name)
 
@@ -129,22 +136,22 @@ def heat_table(
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def looks_of(table: Table) -> list[tuple[Group, Look]]:
+def looks_of(results: "Results") -> list[tuple[Group, Look]]:
     """A group's look is its identity's, whatever its status."""
-    found = looks(dict.fromkeys(group.identity for group in table.groups))
-    return [(group, found[group.identity]) for group in table.groups]
+    found = looks(dict.fromkeys(group.identity for group in results.groups))
+    return [(group, found[group.identity]) for group in results.groups]
 
 
-def _with_unit(column: Column) -> str:
-    return f"{column.title}, {column.note}" if column.note else column.title
+def with_unit(column: Column) -> str:
+    return f"{column.title}, {column.about}" if column.about else column.title
 
 
-def _better(column: Column) -> str:
+def better(column: Column) -> str:
     return "higher" if column.better > 0 else "lower"
 
 
 def _short(group: Group, column: Column) -> str:
-    return f"{group.entries[column.name].mean:.{column.digits}f}"
+    return number(group.entries[column.name].mean, column)
 
 
 def _point(axes: Axes, group: Group, across: Column, down: Column, look: Look) -> None:
@@ -168,7 +175,7 @@ def _number(axes: Axes, spots: Mapping[int, tuple[float, float]]) -> None:
     figure.draw_without_rendering()  # settles the limits and the layout
     to_points = 72 / figure.dpi
     taken = list(axes.transData.transform(np.array(list(spots.values()))) * to_points)
-    for number, own in zip(spots, taken.copy(), strict=True):
+    for label, own in zip(spots, taken.copy(), strict=True):
         offsets = [r * np.array([math.cos(a), math.sin(a)]) for r in RINGS for a in ANGLES]
         rooms = [min(np.hypot(*(own + o - t)) for t in taken) for o in offsets]
         free = (i for i, room in enumerate(rooms) if room >= ROOM)
@@ -176,8 +183,8 @@ def _number(axes: Axes, spots: Mapping[int, tuple[float, float]]) -> None:
         taken.append(own + offset)
         far = np.hypot(*offset) > RINGS[0]
         axes.annotate(
-            str(number),
-            spots[number],
+            str(label),
+            spots[label],
             tuple(offset),
             textcoords="offset points",
             ha="center",
@@ -210,26 +217,56 @@ def _where_timed(groups: Sequence[Group]) -> str:
     return ", ".join(["batch 1", *sizes]) + "\n" + ", ".join([*devices, *counts])
 
 
-def _class_quality(group: Group) -> dict[str, float]:
-    """Percent per class, mean over the group's seeds."""
+def _per_class(group: Group, column: Column) -> dict[str, float]:
+    """Mean over the group's seeds, in the column's unit."""
+    task, _, metric = column.key.rpartition(".")
+    key = re.compile(rf"{re.escape(task)}\.class\.(.+)\.{re.escape(metric)}")
     per_seed = []
     for row in group.rows:
-        found = {CLASS.fullmatch(key): value for key, value in row.get("metric", {}).items()}
-        per_seed.append({m[1]: v for m, v in found.items() if m and v is not None})
+        found = {key.fullmatch(name): value for name, value in row.get("metric", {}).items()}
+        per_seed.append({m[1]: v * column.scale for m, v in found.items() if m and v is not None})
     return {str(k): float(v) for k, v in pd.DataFrame(per_seed, dtype=float).mean().items()}
 
 
-def watermark(axes: Axes, table: Table) -> None:
-    if table.smoke:
-        axes.text(
-            0.5,
-            0.5,
-            SMOKE,
-            transform=axes.transAxes,
-            ha="center",
-            va="center",
-            rotation=15,
-            color=GRAY,
-            alpha=0.45,
-            fontsize=13,
-        )
+def watermark(axes: Axes, results: "Results") -> None:
+    if results.smoke:
+        look: dict[str, Any] = {"rotation": 15, "color": GRAY, "alpha": 0.45, "fontsize": 13}
+        axes.text(0.5, 0.5, SMOKE, transform=axes.transAxes, ha="center", va="center", **look)
+
+
+# --- the Pareto front -----------------------------------------------------------------------------
+
+
+def front(points: Sequence[Point], better: tuple[int, int] = (+1, +1)) -> list[int]:
+    """Indices of the points that are not dominated, by growing first number.
+
+    Args:
+        better: of each number, +1: higher, -1: lower.
+
+    A point is dominated by one that is at least as good in both numbers and better in one; equal
+    points do not dominate each other. Unlike a convex hull, it has no point of a mixture.
+    """
+    signed = [(better[0] * x, better[1] * y) for x, y in points]
+
+    def dominated(own: Point) -> bool:
+        return any(x >= own[0] and y >= own[1] and (x, y) != own for x, y in signed)
+
+    kept = [index for index, own in enumerate(signed) if not dominated(own)]
+    return sorted(kept, key=lambda index: points[index])
+
+
+def draw_front(axes: Axes, points: Sequence[Point], better: int) -> None:
+    """The front as stairs from edge to edge of axes that show the points already.
+
+    Args:
+        better: of the second number, +1: higher, -1: lower; of the first it is higher.
+
+    Their height is the second number that can be had at the first number or more.
+    """
+    corners = [points[index] for index in front(points, (+1, better))]
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    ends = (left, corners[0][1]), (corners[-1][0], low if better > 0 else high)
+    xs, ys = zip(ends[0], *corners, ends[1], strict=True)
+    axes.plot(xs, ys, drawstyle="steps-pre", color=GRAY, linewidth=1.2, zorder=1)
+    axes.set_xlim(left, right)
+    axes.set_ylim(low, high)

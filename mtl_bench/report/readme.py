@@ -14,8 +14,8 @@ import tomllib
 from pathlib import Path
 
 from mtl_bench.bench.grid import GRIDS
-from mtl_bench.report import FIGURES
-from mtl_bench.report.layout import Layout
+from mtl_bench.report.columns import figures
+from mtl_bench.report.grid import Layout
 
 START = re.compile(r"<!-- results:(\S+) -->\n")
 
@@ -41,7 +41,7 @@ def filled(readme: Path, name: str, report_dir: Path) -> str:
         raise ValueError(f"{readme} has no line '{start}' with a line '<!-- /results -->' after it")
     where = Path(os.path.relpath(report_dir, readme.parent)).as_posix()
     pictures = [
-        f"![{FIGURES[stem]}]({where}/{stem}.png)"
+        f"![{figures()[stem]}]({where}/{stem}.png)"
         for stem in _pictures(name)
         if (report_dir / f"{stem}.png").is_file()
     ]
@@ -65,7 +65,7 @@ def _pictures(name: str) -> tuple[str, ...]:
     """What the report's grid shows in a README; the usual ones for a grid that is not shipped."""
     path = GRIDS / f"{name.removesuffix('-smoke')}.toml"
     values = tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return Layout.of(values.get("report", {})).readme
+    return Layout.of(values.get("report", {})).pictures
 
 
 def _main(readme: Path, reports: Path) -> None:

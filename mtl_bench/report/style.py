@@ -5,7 +5,6 @@ and a line style of its own go with each, so that nothing hangs on colour alone.
 """
 
 import io
-import re
 from collections.abc import Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,19 +22,6 @@ DASHES = ("-", "--", "-.", ":")
 T = TypeVar("T", bound=Hashable)
 BASELINE: dict[str, Any] = {"color": "#555555", "linestyle": (0, (1, 1.5)), "linewidth": 1.4}
 GRAY = "#666666"
-NUMBERS = re.compile(r'\b(?:d|x|y)="[^"]*"')
-DECIMALS = re.compile(r"-?\d+\.\d+")
-COMMAND = re.compile(r"\s*([A-Za-z])\s+(?=[-\d])|\s+(?=z)")
-STYLE = re.compile(r'style="[^"]*"')
-FONTS = "'DejaVu Sans',Verdana,sans-serif"  # Verdana is as wide
-UNNEEDED = re.compile(
-    r"<!--.*?-->|<metadata>.*?</metadata>"
-    r"|font-family:'DejaVu Sans';"
-    r'|(?<=<g) id="[^"]*"'  # of groups: nothing refers to them
-    r'| transform="rotate\(-0 [^"]*\)"',  # by nothing
-    re.DOTALL,
-)
-BETWEEN = re.compile(r">\s+<")
 
 SETTINGS: dict[Any, Any] = {
     "svg.hashsalt": "mtl-bench",  # ids without randomness
@@ -85,7 +71,7 @@ def styled() -> Iterator[None]:
 
 
 def save(figure: Figure, out_dir: Path, name: str, pixels: bool = False) -> None:
-    """`name.png` and `name.svg`, without dates, and small: reports are committed.
+    """`name.png`, small, since reports are committed, and `name.svg`; both without dates.
 
     Args:
         pixels: a picture of pixels, which are not scaled; it has no SVG.
@@ -99,24 +85,6 @@ def save(figure: Figure, out_dir: Path, name: str, pixels: bool = False) -> None
     image = image.quantize(256, choice, kmeans=1, dither=Image.Dither.NONE)
     image.save(out_dir / f"{name}.png", optimize=True)
     if not pixels:
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-        drawing = _compact(buffer.getvalue())
-        (out_dir / f"{name}.svg").write_text(drawing, encoding="utf-8", newline="\n")
-
-
-def _compact(drawing: str) -> str:
-    """An SVG at half its size: coordinates of a tenth of a point, one font, nothing unneeded."""
-    for pattern, new in ((NUMBERS, _shorten), (STYLE, _without_blanks), (UNNEEDED, "")):
-        drawing = pattern.sub(new, drawing)
-    return BETWEEN.sub("><", drawing).replace("</style>", f"text{{font-family:{FONTS}}}</style>")
-
-
-def _without_blanks(style: re.Match[str]) -> str:
-    return style[0].replace(": ", ":").replace("; ", ";")
-
-
-def _shorten(numbers: re.Match[str]) -> str:
-    """A tenth of a point is finer than a line is wide."""
-    values = DECIMALS.sub(lambda number: f"{float(number[0]):.1f}".removesuffix(".0"), numbers[0])
-    return COMMAND.sub(r"\1", values)
+        drawing = io.StringIO()
+        figure.savefig(drawing, format="svg", metadata={"Date": None, "Creator": None})
+        (out_dir / f"{name}.svg").write_text(drawing.getvalue(), encoding="utf-8", newline="\n")

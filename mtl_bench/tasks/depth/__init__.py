@@ -81,11 +81,13 @@ class Depth(Task):
             note="median-scaled",
             in_delta=True,
             headline=True,
+            words="depth error",
         ),
         Column(
             *("delta1", "depth_median.delta1", "delta1", +1, 3),
             note="median-scaled",
             in_delta=True,
+            tex=r"$\delta_1$",
         ),
         Column(
             *("rmse_dgc", "depth_dgc.rmse", "RMSE dgc", -1, 2, "m"), note="dgc-scaled", short=True

@@ -67,7 +67,12 @@ class Panoptic(Task):
     categorical = frozenset({"semantic"})
     makes_labels = True
     columns = (
-        Column("pq", "panoptic.pq", "PQ", +1, 1, "%", in_delta=True, headline=True),
+        Column(
+            *("pq", "panoptic.pq", "PQ", +1, 1, "%"),
+            in_delta=True,
+            headline=True,
+            words="panoptic quality",
+        ),
         Column("pq_things", "panoptic.pq_things", "PQ things", +1, 1, "%"),
         Column("pq_stuff", "panoptic.pq_stuff", "PQ stuff", +1, 1, "%"),
         Column("miou", "semantic.miou", "mIoU", +1, 1, "%", in_delta=True, short=True),

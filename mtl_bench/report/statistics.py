@@ -4,11 +4,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from mtl_bench.report.columns import BY_NAME, COLUMNS, RELATIVE, Row, flatten, measured
+from mtl_bench.core.columns import Column
+from mtl_bench.report.columns import DELTA, RELATIVE, Row, columns, flatten, measured, text
 
 SMOKE = "smoke: not a result"
 PSEUDO = "recipe.pseudo."  # the video stage's settings: no number of a cell without it
@@ -24,8 +26,7 @@ KNOWN = (  # axes in the order in which they stand
     *("method", "backbone", "tasks", "single_task", "video", "granularity"),
     *("pretrained", "recipe.name"),
 )
-DELTAS = ("delta_flat", "delta_task")
-ALL = (*COLUMNS, *RELATIVE)
+SHOWN = ("done", "stale")  # statuses that have numbers
 
 
 @dataclass(frozen=True)
@@ -53,11 +54,6 @@ class Group:
         """What a reader must know before reading the numbers; empty for a plain result."""
         marks = ("stale" if self.status == "stale" else "", SMOKE if self.smoke else "")
         return "; ".join(filter(None, marks))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The identity with the mark beside it."""
-        return (self.identity[0] + (f" ({self.mark})" if self.mark else ""), *self.identity[1:])
 
     @property
     def label(self) -> str:
@@ -100,7 +96,6 @@ def axes_of(rows: Sequence[Row], axis: str) -> tuple[str, ...]:
 
 def grouped(
     rows: Sequence[Row],
-    shown: Sequence[str],
     axes: tuple[str, ...],
     trivial: Group | None = None,
     reference: str | None = None,
@@ -108,7 +103,6 @@ def grouped(
     """The lines, in the order in which their first cells come, with numbers or without.
 
     Args:
-        shown: statuses that have numbers.
         trivial: what a leader has to beat, too.
         reference: value of the first axis whose line the RELATIVE columns are relative to.
     """
@@ -118,7 +112,7 @@ def grouped(
         key = json.dumps(cell_of(row), sort_keys=True)
         order.setdefault(key, i)
         status = row.get("status", "done")
-        if status in shown:
+        if status in SHOWN:
             members.setdefault((key, status, bool(row.get("smoke"))), []).append(row)
     groups = [
         Group(
@@ -135,20 +129,20 @@ def grouped(
 
 
 def trivial_group(baseline: Row, axes: tuple[str, ...]) -> Group:
-    entries = {c.name: Entry(measured(baseline, c), count=1) for c in ALL}
-    entries = {k: Entry() if math.isnan(e.mean) else e for k, e in entries.items()}
-    return Group(("trivial predictor", *("" for _ in axes[1:])), "trivial", False, (), entries)
+    name = ("trivial predictor", *("" for _ in axes[1:]))
+    return Group(name, "trivial", False, (), _entries([baseline]))
 
 
-def text(value: Any) -> str:
-    """A setting as a reader writes it."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, (list, tuple)):
-        return ", ".join(text(item) for item in value) or "none"
-    if isinstance(value, float):
-        return f"{value:g}"
-    return "none" if value is None else str(value)
+def entry_of(values: Sequence[float]) -> Entry:
+    """Of those that are no NaN."""
+    known = pd.Series(values, dtype=float)
+    return Entry(float(known.mean()), float(known.std()), int(known.count()))
+
+
+def kept(group: Group, runs_root: Path, name: str) -> list[Path]:
+    """The files of this name that the group's runs have kept."""
+    paths = (runs_root / str(row.get("slug", "")) / name for row in group.rows)
+    return [path for path in paths if path.is_file()]
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -160,12 +154,8 @@ def _varies(cells: list[dict[str, Any]], key: str) -> bool:
 
 
 def _entries(rows: Sequence[Row]) -> dict[str, Entry]:
-    values = pd.DataFrame({c.name: [measured(row, c) for row in rows] for c in ALL})
-    summary = zip(values.mean(), values.std(), values.count(), strict=True)
-    return {
-        str(name): Entry(float(mean), float(std), int(count))
-        for name, (mean, std, count) in zip(values.columns, summary, strict=True)
-    }
+    every = (*columns(), *RELATIVE)
+    return {c.name: entry_of([measured(row, c) for row in rows]) for c in every}
 
 
 def _with_relative(group: Group, groups: list[Group], reference: str | None) -> Group:
@@ -181,27 +171,25 @@ def _with_relative(group: Group, groups: list[Group], reference: str | None) -> 
 
 
 def _with_leaders(group: Group, groups: list[Group], trivial: Group | None) -> Group:
-    entries = {
-        name: Entry(e.mean, e.std, e.count, _leads(group, name, groups, trivial))
-        for name, e in group.entries.items()
-    }
+    entries = dict(group.entries)
+    for column in columns():
+        leads = _leads(group, column, groups, trivial)
+        entries[column.name] = replace(entries[column.name], bold=leads)
     return replace(group, entries=entries)
 
 
-def _leads(group: Group, name: str, groups: list[Group], trivial: Group | None) -> bool:
+def _leads(group: Group, column: Column, groups: list[Group], trivial: Group | None) -> bool:
     """Whether it is ahead of every other by more than its own and the other's spread."""
     rivals = [other for other in groups if other is not group and not other.mark]
-    own = group.entries[name]
+    own = group.entries[column.name]
     if group.mark or not rivals or own.count < 2:
         return False
-    better = BY_NAME[name].better
     for rival in rivals:
-        other = rival.entries[name]
+        other = rival.entries[column.name]
         if other.count == 1:
             return False  # its spread is not known
-        if other.count and better * (own.mean - other.mean) <= max(own.std, other.std):
+        if other.count and column.better * (own.mean - other.mean) <= max(own.std, other.std):
             return False
-    floor = trivial.entries[name] if trivial else Entry()
-    if name in DELTAS:
-        floor = Entry(0.0, count=1)  # the baseline's
-    return not floor.count or better * (own.mean - floor.mean) > own.std
+    floor = trivial.entries[column.name] if trivial else Entry()
+    floor = Entry(0.0, count=1) if column in DELTA else floor  # the baseline's own
+    return not floor.count or column.better * (own.mean - floor.mean) > own.std

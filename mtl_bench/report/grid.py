@@ -1,0 +1,507 @@
+"""A grid's report: a line for all cells that differ only in their seed, figures and a page.
+
+Cells of different status never share a line, and neither do measured, trivial and published values.
+"""
+
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from markupsafe import Markup
+
+from mtl_bench.core import quality
+from mtl_bench.core.columns import FPS, Column
+from mtl_bench.core.config import to_dict
+from mtl_bench.core.plain import did_you_mean, from_dict
+from mtl_bench.report import columns as known
+from mtl_bench.report import curves, facts, pictures, plots, protocol
+from mtl_bench.report.columns import DELTA, ONLY, RELATIVE, Row, headlines, pairs, per_class, text
+from mtl_bench.report.delta import counted
+from mtl_bench.report.page import Page, figures_of, forget, render
+from mtl_bench.report.statistics import (
+    SHOWN,
+    SMOKE,
+    Group,
+    axes_of,
+    cell_of,
+    grouped,
+    kept,
+    trivial_group,
+)
+from mtl_bench.report.style import MANY
+from mtl_bench.report.table import (
+    ARROWS,
+    NOTHING,
+    Cell,
+    Head,
+    Section,
+    Table,
+    TableRow,
+    markdown,
+    numbers,
+    single,
+    write,
+)
+
+PUBLISHED = Path(__file__).parent / "literature.toml"
+AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
+WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples", "extremes")
+TRAINED_BRIEFLY = "Cells marked smoke were trained for a few steps to show that the pipeline works."
+NUMERALS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a grid file's section [report] may say.
+
+    Raises:
+        ValueError: a column, figure or part that does not exist.
+    """
+
+    rows: str = "backbone"  # the field of a cell that names a line, or "name": the file's [[row]]s
+    first: tuple[str, ...] = ()  # columns that stand before the others
+    only: str | None = None  # "cost": step time and memory alone, without figures
+    reference: str | None = None  # the line (value of `rows`) that these two are relative to, too
+    readme: tuple[str, ...] | None = None  # figures beside the table in a README; None: over speed
+
+    def __post_init__(self) -> None:
+        _check("column", self.first, [column.name for column in known.columns()])
+        _check("figure", self.readme or (), known.figures())
+        _check("part", () if self.only is None else (self.only,), ONLY)
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> "Layout":
+        """From a grid file's section.
+
+        Raises:
+            ValueError: an unknown key, a value of another type, or what `Layout` raises.
+        """
+        return from_dict(Layout, values, "report.")
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """Stems of the figures that a README shows."""
+        over_speed = (f"{column.name}_{FPS.name}" for column in headlines())
+        return tuple(over_speed) if self.readme is None else self.readme
+
+
+def _check(kind: str, names: Iterable[str], possible: Iterable[str]) -> None:
+    possible = tuple(possible)
+    for name in names:
+        if name not in possible:
+            raise ValueError(f"[report] names no {kind} '{name}'{did_you_mean(name, possible)}")
+
+
+# --- what was measured ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """A cell without numbers and why."""
+
+    label: str
+    slug: str
+    status: str  # failed | interrupted | running | missing | skipped
+    reason: str
+
+
+@dataclass(frozen=True)
+class Results:
+    """A grid's rows in groups; nothing is drawn or written yet."""
+
+    axes: tuple[str, ...]
+    groups: tuple[Group, ...]
+    baseline: Group | None
+    unfinished: tuple[Unfinished, ...]
+    published: tuple[Mapping[str, Any], ...]
+    all_columns: tuple[Column, ...]
+    reference: str | None = None  # the line that some columns are relative to
+
+    @property
+    def lines(self) -> tuple[Group, ...]:
+        return self.groups + ((self.baseline,) if self.baseline else ())
+
+    @property
+    def smoke(self) -> bool:
+        return any(group.smoke for group in self.groups)
+
+    def columns(self, part: str | None = None) -> list[Column]:
+        """Those that some group has; of one part, where one is named."""
+        return [
+            column
+            for column in self.all_columns
+            if part in (None, column.part)
+            and any(g.entries[column.name].count for g in self.groups)
+        ]
+
+
+def tabulate(
+    rows: Sequence[Row], layout: Layout | None = None, baseline: Row | None = None
+) -> Results:
+    """Group rows by everything but the seed, and say which group leads each column.
+
+    Args:
+        rows: as `row.json` holds them, with a status; rows without numbers have an error at most.
+        layout: which field of a cell names a line (others join it where they differ), which
+            columns there are and how they are ordered.
+        baseline: metrics of the trivial predictor.
+    """
+    layout = layout or Layout()
+    axes = axes_of([row for row in rows if row.get("status", "done") in SHOWN], layout.rows)
+    trivial = None if baseline is None or layout.only else trivial_group(baseline, axes)
+    return Results(
+        axes=axes,
+        groups=tuple(grouped(rows, axes, trivial, layout.reference)),
+        baseline=trivial,
+        unfinished=tuple(
+            _unfinished(r, axes) for r in rows if r.get("status", "done") not in SHOWN
+        ),
+        published=published(layout.rows, {text(cell_of(row).get(layout.rows)) for row in rows}),
+        all_columns=_columns(layout),
+        reference=layout.reference,
+    )
+
+
+def published(axis: str, names: Iterable[str]) -> tuple[Mapping[str, Any], ...]:
+    """The lists of published rows that belong to this row axis.
+
+    A list of named rows belongs to the grid that has at least two of its names.
+    """
+    lists = tomllib.loads(PUBLISHED.read_text(encoding="utf-8"))["published"]
+    return tuple(
+        entry
+        for entry in lists
+        if entry["axis"] == axis
+        and (axis != "name" or len({row["name"] for row in entry["rows"]} & set(names)) > 1)
+    )
+
+
+def _columns(layout: Layout) -> tuple[Column, ...]:
+    """All that a table of this layout may show, in its order."""
+    columns = list(known.columns())
+    if layout.reference is not None:
+        for column in RELATIVE:  # each behind the one that it is made of
+            at = next(i for i, other in enumerate(columns) if other.name == column.key)
+            columns.insert(at + 1, replace(column, unit=f"x of {layout.reference}"))
+    if layout.only is not None:
+        columns = [column for column in columns if column.name in ONLY[layout.only]]
+    first = {name: i for i, name in enumerate(layout.first)}
+    return tuple(sorted(columns, key=lambda column: first.get(column.name, len(first))))
+
+
+def _unfinished(row: Row, axes: tuple[str, ...]) -> Unfinished:
+    cell = cell_of(row)
+    label = ", ".join(text(cell[axis]) for axis in axes if axis in cell)
+    lines = [line.strip() for line in str(row.get("error") or "").splitlines() if line.strip()]
+    seed = f", seed {row['seed']}" if "seed" in row else ""
+    return Unfinished(
+        label=(label or str(row.get("slug", ""))) + seed,
+        slug=str(row.get("slug", "")),
+        status=str(row["status"]),
+        reason=lines[-1] if lines else "no numbers yet",
+    )
+
+
+# --- the table ------------------------------------------------------------------------------------
+
+
+def fill(results: Results, short: bool = False) -> Table:
+    """Quality and cost, then what has no numbers, what others published, and the notes.
+
+    Args:
+        short: one table of the main columns in place of quality and cost, as for a README.
+    """
+    notes = tuple(footnotes(results))
+    main = [c for c in results.columns() if c.short or c.headline]
+    banner = f"{SMOKE.capitalize()}." if results.smoke else ""
+    said = {"Quality": f" {' '.join(notes)}"}
+    lacking = [TableRow.of(c.label, c.status, c.reason, c.slug) for c in results.unfinished]
+    why = Head("why", left=True, css="wrap"), Head("folder", left=True, page_only=True)
+    heads = (*Head.words("cell", "status"), *why)
+    return Table(
+        sections=tuple(
+            _section(results, heading, columns, f"{banner} {heading}.{said.get(heading, '')}")
+            for heading, columns in ([("", main)] if short and main else parts_of(results))
+        ),
+        notes=notes,
+        records=tuple(_records(results)),
+        lacking=(Section("Without numbers", heads, tuple(lacking)),) if lacking else (),
+        published=tuple(_published(source, results.axes[0]) for source in results.published),
+        banner=banner,
+    )
+
+
+def parts_of(results: Results) -> list[tuple[str, list[Column]]]:
+    """Quality with the speed that pays for it, and the cost."""
+    speed = [column for column in results.columns() if column == FPS]
+    main = results.columns("quality")
+    parts = [("Quality", main and main + speed), ("Cost", results.columns("cost"))]
+    return [(heading, columns) for heading, columns in parts if columns]
+
+
+def axis_title(axis: str) -> str:
+    return AXES.get(axis, axis.removeprefix("recipe."))
+
+
+def _section(results: Results, heading: str, columns: Sequence[Column], caption: str) -> Section:
+    """The lines that have a value in one of these columns."""
+    shown = [g for g in results.lines if any(g.entries[c.name].count for c in columns)]
+    return Section(
+        heading=heading,
+        heads=(*Head.words(*map(axis_title, results.axes)), Head("n"), *map(Head.of, columns)),
+        lines=tuple(_line(group, columns) for group in shown),
+        caption=caption.strip(),
+    )
+
+
+def _line(group: Group, columns: Iterable[Column]) -> TableRow:
+    seeds = NOTHING if group.status == "trivial" else str(len(group.rows))
+    name = Cell.marked(group.identity[0], group.mark)
+    values = [Cell.of(group.entries[c.name], c, len(group.rows)) for c in columns]
+    css = group.status + " smoke" * group.smoke
+    return TableRow.of(name, *group.identity[1:], seeds, *values, css=css)
+
+
+def _published(source: Mapping[str, Any], axis: str) -> Section:
+    shown = [c for c in (*headlines(), FPS) if any(c.name in row for row in source["rows"])]
+    units = [f" ({c.unit})" if c.unit.isalpha() else "" for c in shown]
+    heads = [Head(f"{c.title}{u} {ARROWS[c.better]}") for c, u in zip(shown, units, strict=True)]
+    rows = [
+        [row["name"], *(f"{row[c.name]:.1f}" if c.name in row else NOTHING for c in shown)]
+        for row in source["rows"]
+    ]
+    why = "other images, another machine"
+    heads = [*Head.words(axis_title(axis)), *heads]
+    return Section.published(source, tuple(heads), rows, "rows", why, fit=False)
+
+
+def _records(results: Results) -> Iterator[dict[str, Any]]:
+    """A line per group: identity, kind, n, then mean and deviation of every column."""
+    for group in results.lines:
+        named = dict(zip(results.axes, group.identity, strict=True))
+        kind = "trivial" if group.status == "trivial" else "measured"
+        named |= {"kind": kind, "mark": group.mark, "n": str(len(group.rows))}
+        relative = RELATIVE if results.reference is not None else ()
+        yield (
+            named
+            | numbers(group.entries, known.columns())
+            | numbers(group.entries, relative, spread=False)
+        )
+    for source in results.published:
+        for row in source["rows"]:
+            named = {results.axes[0]: row["name"], "kind": "published", "mark": source["mark"]}
+            found = [c for c in known.columns() if c.headline and c.name in row]
+            found.sort(key=lambda c: bool(c.note))  # papers do not say what a note says of ours
+            yield named | {c.name + "_published" * bool(c.note): row[c.name] for c in found}
+    for cell in results.unfinished:
+        named = {results.axes[0]: cell.label, "kind": cell.status, "mark": cell.reason}
+        yield named | {"n": "0"}
+
+
+# --- what a reader must know ----------------------------------------------------------------------
+
+
+def footnotes(results: Results) -> Iterator[str]:
+    """One sentence or two for each thing that occurs in the table; `+-` stands for the sign."""
+    groups = results.groups
+    if any(len(group.rows) > 1 for group in groups):
+        floor = ", and of the trivial predictor by more than its own" if results.baseline else ""
+        yield (
+            "Mean +- sample standard deviation over n seeds. Bold: ahead of every other plain line "
+            f"by more than either's spread{floor}."
+        )
+    if any(len(group.rows) == 1 for group in [g for g in groups if not g.mark] or groups):
+        yield (
+            "n = 1: one seed has no spread, so a lead by it or over it cannot be told from chance, "
+            "and nothing is bold."
+        )
+    if any(0 < e.count < len(g.rows) for g in groups for e in g.entries.values()):
+        yield "A number with its own n is the mean over those seeds that have the value."
+    if DELTA[0] in results.columns():
+        yield _delta(results)
+    if results.reference is not None:
+        yield from _relative(results, results.reference)
+    if results.baseline:
+        yield facts.TRIVIAL
+    stale = [row for group in groups if group.status == "stale" for row in group.rows]
+    if stale:
+        why = ", ".join(dict.fromkeys(str(row["error"]) for row in stale if row.get("error")))
+        because = f" ({why})" if why else ""
+        yield f"Stale: code changed after these cells ran{because}; run again with --rerun stale."
+    if any(group.smoke for group in groups):
+        yield "Smoke: a few training steps that show that the pipeline works. Not a result."
+
+
+def _delta(results: Results) -> str:
+    rows = [row for group in results.groups for row in group.rows]
+    own = [row for row in rows if "delta_baseline" in row]
+    against = " or ".join(dict.fromkeys(str(row["delta_baseline"]) for row in own))
+    metrics = counted(rows)
+    tasks = list(dict.fromkeys(column.task for column in metrics))
+    named = ", and ".join(_named([c for c in metrics if c.task == task]) for task in tasks)
+    return (
+        f"Delta: over {named}, relative to the baseline ({against}) of the same seed. "
+        f"Flat: mean relative loss over the {_count(metrics)} metrics, so that "
+        "less is better and a negative one is a gain. Task: mean relative gain, first over a "
+        f"task's metrics and then over the {_count(tasks)} tasks, so that more is better. The "
+        "baseline's own is 0 by definition and not shown; bold is ahead of it, too."
+    )
+
+
+def _named(metrics: Sequence[Column]) -> str:
+    """The titles, with what was done to all of them before: `median-scaled A, B and C`."""
+    titles = [column.title for column in metrics]
+    if not metrics[0].note:
+        return ", ".join(titles)
+    joined = " and ".join(filter(None, (", ".join(titles[:-1]), titles[-1])))
+    return f"{metrics[0].note} {joined}"
+
+
+def _count(things: Sequence[Any]) -> str:
+    return NUMERALS[len(things)] if len(things) < len(NUMERALS) else str(len(things))
+
+
+def _relative(results: Results, reference: str) -> Iterator[str]:
+    if any(group.entries[column.name].count for group in results.groups for column in RELATIVE):
+        yield f"x of {reference}: a line's mean over that of the line '{reference}'."
+    else:
+        yield f"Nothing is relative to '{reference}': no such line has numbers."
+
+
+# --- the report -----------------------------------------------------------------------------------
+
+
+def build(
+    grid: Any,
+    rows: Sequence[Row],
+    out_dir: Path,
+    runs_root: Path | None = None,
+    baseline: Row | None = None,
+    command: str = "",
+) -> Path:
+    """Write the page, the tables and the figures; the same rows give the same bytes.
+
+    The tables are `table.{csv,md,tex}` whole and `readme.md` with the main columns.
+
+    Args:
+        grid: its name, question, recipe, and under `report` what `Layout` says.
+        rows: one per cell in the grid's order, as `row.json` holds them, with a status; a row
+            without numbers has at least what names its cell, and its error.
+        out_dir: created where absent; what an earlier build left is replaced.
+        runs_root: where the runs' curves and samples are; without it those figures are left out.
+        baseline: the trivial predictor's metrics, under the same keys as a row's.
+        command: what reproduces the report.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        ValueError: `grid.report` has a key or a value that it cannot have.
+    """
+    layout = Layout.of(grid.report)
+    has_section = baseline is None or "metric" in baseline
+    rows = [*rows, *_skipped(grid)]
+    results = tabulate(rows, layout, baseline if has_section else {"metric": baseline})
+    out_dir.mkdir(parents=True, exist_ok=True)
+    forget(known.figures(), out_dir)
+    captions = {} if layout.only else _draw(results, out_dir, runs_root)
+    wide = known.figures() if len(results.groups) > MANY else WIDE
+    table = fill(results)
+    page = Page(
+        kind="grid",
+        title=f"{grid.name}: mtl-bench report",
+        heading=grid.question or grid.name,
+        about=Markup("Grid <b>{}</b>, recipe <b>{}</b>. Cells: {}.").format(
+            grid.name, getattr(grid.recipe, "name", grid.recipe), _states(rows) or "none"
+        ),
+        command=command,
+        banner=results.smoke * f"{table.banner} {TRAINED_BRIEFLY}",
+        lacking="Cells without numbers",
+        nothing="No cell of this grid has numbers yet.",
+        figures=[
+            replace(figure, wide=figure.name in wide)
+            for figure in figures_of(known.figures(), captions)
+        ],
+        protocol=protocol.of_cells([row for group in results.groups for row in group.rows]),
+        of="cells",
+        counted=counted_images(results),
+        folded=_every_cell(rows),
+    )
+    more = {
+        "readme.md": markdown(fill(results, short=True)),
+        "index.html": render(page, table, out_dir),
+    }
+    return write(table, out_dir, more)
+
+
+def _skipped(grid: Any) -> list[Row]:
+    """The cells that the grid leaves out, as rows that say why."""
+    names = getattr(grid, "names", {})
+    return [
+        {
+            **({"name": names[skip.cell.id]} if skip.cell.id in names else {}),
+            "slug": skip.cell.slug,
+            "seed": skip.cell.seed,
+            "cell": to_dict(skip.cell),
+            "status": "skipped",
+            "error": skip.why,
+        }
+        for skip in getattr(grid, "skips", ())
+    ]
+
+
+def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, str | None]:
+    """Draw all that can be drawn; what each figure shows, by its stem."""
+    captions = {f"{y.name}_{x.name}": plots.against(results, y, x, out_dir) for y, x in pairs()}
+    captions |= {
+        stem: plots.classes(results, column, out_dir, stem) for stem, column in per_class().items()
+    }
+    if runs_root is not None:
+        runs = {
+            group.label: frames
+            for group in results.groups
+            if (frames := [pd.read_csv(path) for path in kept(group, runs_root, "curve.csv")])
+        }
+        captions["loss_curves"] = curves.terms(results, runs, "loss", out_dir)
+        captions["weight_curves"] = curves.terms(results, runs, "weight", out_dir)
+        captions["diagnostics"] = curves.diagnostics(results, runs, out_dir)
+        captions["samples"] = pictures.draw(results, runs_root, out_dir)
+        captions["extremes"] = pictures.extremes(results, runs_root, out_dir)
+    return captions
+
+
+def counted_images(results: Results) -> Section | None:
+    """What the evaluation counted, summed over a group's seeds."""
+    lines = []
+    for group in results.groups:
+        values = [[row.get("metric", {}).get(key) for row in group.rows] for key in facts.COUNTS]
+        found = [[value for value in several if value is not None] for several in values]
+        if any(found):
+            sums = [Cell(f"{sum(several):g}" if several else NOTHING) for several in found]
+            lines.append(TableRow.of(group.label, *sums))
+    heads = (*Head.words(axis_title(results.axes[0])), *map(Head, facts.COUNTS.values()))
+    return Section(facts.COUNTED, heads, tuple(lines)) if lines else None
+
+
+def _states(rows: Iterable[Row]) -> str:
+    """`11 done, 1 failed`."""
+    states = [str(row.get("status", "done")) for row in rows]
+    order = dict.fromkeys((*SHOWN, *sorted(states)))
+    return ", ".join(f"{states.count(state)} {state}" for state in order if state in states)
+
+
+def _every_cell(rows: Sequence[Row]) -> Section | None:
+    """Every cell on its own: slug, seed, status, and the numbers that carry the table."""
+    shown = [*(c for c in quality.quality() if c in quality.in_brief()), FPS]
+    lines = []
+    for row in rows:
+        state = str(row.get("status", "done")) + " (smoke)" * bool(row.get("smoke"))
+        named = str(row.get("slug", "")), text(row.get("seed", "")), state
+        lines.append(TableRow.of(*named, *(single(row, column) for column in shown)))
+    heads = [Head("run", left=True), Head("seed"), Head("status", left=True)]
+    heads += [Head(column.title) for column in shown]
+    about = f"{len(rows)} cells, one line each"
+    return Section("Every cell", tuple(heads), tuple(lines), source=about) if rows else None
