@@ -31,7 +31,8 @@ OWN |= {"normals.class.road.mean_angle": 12.0, "normals.class.hut.mean_angle": 3
 def third_task(monkeypatch):
     """The task's column and picture, as it would declare them."""
     angles = Picture("normals", "normals", lambda image, normals: np.uint8(normals * 127 + 128))
-    monkeypatch.setattr(quality, "QUALITY", (*quality.QUALITY, ANGLE))
+    known = quality.quality()
+    monkeypatch.setattr(quality, "quality", lambda: (*known, ANGLE))
     monkeypatch.setattr(facts, "PICTURES", (*facts.PICTURES, angles))
 
 
@@ -146,4 +147,4 @@ def test_no_module_names_a_task(path):
 
 
 def test_facts_name_tasks_that_exist():
-    assert {column.task for column in quality.QUALITY} - {"normals"} == set(config.TASKS)
+    assert {column.task for column in quality.quality()} - {"normals"} == set(config.Recipe.tasks)
