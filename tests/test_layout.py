@@ -1,4 +1,4 @@
-"""The house stays in order: short files, one direction of imports, a quick command line."""
+"""The house stays in order: files of one idea, one direction of imports, a quick command line."""
 
 import ast
 import os
@@ -14,7 +14,7 @@ from mtl_bench.core import plugins, provenance
 
 PACKAGE = plugins.PACKAGE
 MODULES = sorted(PACKAGE.rglob("*.py"))
-LINES = 300
+LINES = 500
 
 # A module imports only from rooms before its own (or from its own).
 ORDER = (
@@ -33,8 +33,8 @@ ORDER = (
         "baselines",
         "export_predictions",
     ),
-    *("latency", "engines", "export", "render", "predict"),
-    *("claim", "results", "stored", "deploy", "run", "check"),
+    *("core", "deploy", "render", "predict"),
+    *("claim", "results", "stored", "run", "check"),
     *(
         "toml_file",
         "grid_file",
@@ -100,7 +100,7 @@ AROUND = {"plain", "recipe", "config", "plugins", "provenance", "quiet", "progre
     [
         (provenance.HARNESS, {"curve", "tracking"}),
         # of a timing's network and frames only shapes count: training and data sets do not
-        (latency_runs.MEASURES, {"data", "evaluate", "export", "results", "stored"}),
+        (latency_runs.MEASURES, {"data", "evaluate"}),
     ],
     ids=["HARNESS", "MEASURES"],
 )
@@ -116,7 +116,7 @@ def literals(tree: ast.AST) -> set[str]:
 
 
 def test_no_module_names_a_method_or_a_backbone():
-    names = {name for kind in plugins.KINDS for name in plugins.files(kind)}
+    names = {name for kind in ("methods", "backbones") for name in plugins.files(kind)}
     assert len(names) >= 8
     named = {
         (relative(path), name)
@@ -154,6 +154,7 @@ assert not heavy & set(sys.modules), heavy & set(sys.modules)
         "--help",
         "list",
         "list -v",
+        "list engines",
         "status --grid backbones",
         "ablate --grid backbones --dry-run",
         "ablate --help",

@@ -31,7 +31,7 @@ Word = Literal["done", "stale", "wrong", "failed", "unavailable", "missing"]
 WORDS: tuple[Word, ...] = get_args(Word)
 BAD = ("wrong", "failed", "missing")  # what makes `ablate` end with 1; an engine may be absent
 MEASURES = (  # what a time depends on beside the backbone
-    *("model", "engines", "engine.py", "latency.py", "deploy.py", "pixels.py", "grouping.py"),
+    *("model", "core", "deploy", "engine.py", "pixels.py", "grouping.py"),
     *("postprocess.py", "finish.py", "depth_scale.py", "geometry.py"),
 )
 AGAIN: dict[str | None, tuple[Word, ...]] = {  # --rerun: what is timed again beside what lacks

@@ -15,9 +15,10 @@ from mtl_bench.core.device import Engine, choose_device
 from mtl_bench.core.quiet import SIDE_BY_SIDE, Quiet
 from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import open_dataset
+from mtl_bench.deploy import maps
+from mtl_bench.deploy.timer import measure
 from mtl_bench.evaluate.export_predictions import export_predictions
 from mtl_bench.evaluate.walk import Evaluation, evaluate
-from mtl_bench.latency import measure
 from mtl_bench.model import Model, side_by_side
 from mtl_bench.train import checkpoint
 from mtl_bench.train.loop import CHECKPOINT, build
@@ -69,6 +70,27 @@ def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
     return model
 
 
+def deployed(path: Path, tasks: tuple[str, ...] | None) -> tuple[Cell, Model]:
+    """A trained cell and its model, as it is deployed.
+
+    Args:
+        path: a run's folder, or its checkpoint.
+        tasks: leave only these; None: all that it was trained for.
+
+    Raises:
+        ValueError: no checkpoint there, or it has not been trained for a task.
+    """
+    if not path.exists():
+        raise ValueError(f"no run or checkpoint '{path}'")
+    weights = path / CHECKPOINT if path.is_dir() else path
+    cell = results.load_cell(weights.parent / "cell.json")
+    model = load_model(cell, weights, Engine(torch.device("cpu")))
+    lacking = [task for task in tasks or () if task not in cell.tasks]
+    if lacking:
+        raise ValueError(f"{path} is trained for {', '.join(cell.tasks)}, not for {lacking[0]}")
+    return cell, maps.keep(model, tasks or cell.tasks)
+
+
 def time_cell(
     model: Model, cell: Cell, root: Path, engine: Engine, quiet: Quiet
 ) -> tuple[dict[str, Any], float]:
@@ -77,7 +99,7 @@ def time_cell(
     On all of this process's cores, which are more than its threads where cells run side by side;
     those hold still meanwhile.
     """
-    recipe = cell.recipe
+    recipe, labels = cell.recipe, labels_of(cell.recipe.data.dataset)
     dataset = open_dataset(cell, recipe.evaluate.split, root, training=False)
     first = dataset.sample(0, None)
     frames = (dataset.sample(index, None) for index in range(min(len(dataset), FRAMES)))
@@ -91,11 +113,13 @@ def time_cell(
             images,
             first.K_B33,
             float(first.camera_height_m_B),
-            labels_of(recipe.data.dataset).things,
+            labels.things,
             recipe.evaluate,
             recipe.latency,
             engine.device,
             engine.precision,
+            labels.index("road"),
+            float(first.camera_pitch_rad_B),
         )
         torch.set_num_threads(threads)
         return timing, time.perf_counter() - start

@@ -1,18 +1,22 @@
-"""Finds, describes and loads the files in methods/ and backbones/; their stems are the names.
+"""Finds, describes and loads the files in methods/, backbones/ and engines/; stems are the names.
 
 Searched in this order: the package's own folders (the checkout's, or those inside an installed
-wheel), `./methods` and `./backbones` of the working directory, and what `--plugins` names: a
-folder with those two in it, a folder of plug-ins of either kind, or one file. A file reached twice
-counts once. `_name.py` is a helper that its neighbours import with `from ._name import ...`.
+wheel; engines are in mtl_bench/deploy/), those of the working directory, and what `--plugins`
+names: a folder with such folders in it, a folder of plug-ins of any kind, or one file. A file
+reached twice counts once. `_name.py` is a helper that its neighbours import with
+`from ._name import ...`.
 
 Finding and describing read the files as text; only `load` runs one.
 """
 
 import ast
+import contextlib
+import functools
 import hashlib
 import importlib
 import importlib.util
 import inspect
+import itertools
 import os
 import re
 import sys
@@ -25,13 +29,14 @@ from typing import Any
 
 from mtl_bench.core.config import TASKS, Cell, did_you_mean
 
-KINDS = ("methods", "backbones")
+KINDS = ("methods", "backbones", "engines")
 PACKAGE = Path(__file__).resolve().parents[1]
 VARIABLE = "MTL_BENCH_PLUGINS"  # what --plugins adds to; the processes that run cells inherit it
 
 BASES = {
     "methods": ("mtl_bench.core.method", "Method"),
     "backbones": ("mtl_bench.core.backbone", "Backbone"),
+    "engines": ("mtl_bench.core.engine", "Engine"),
 }
 GIVEN = ("self", "terms", "seed", "strides", "pretrained")  # the harness fills these arguments in
 NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -69,6 +74,8 @@ def folders(kind: str) -> list[Path]:
     """Where plug-ins of a kind are searched, in order; only those that exist."""
     shipped = PACKAGE / "_shipped"
     own = shipped if shipped.is_dir() else PACKAGE.parent
+    if kind == "engines":
+        own = PACKAGE / "deploy"
     extra = [Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep) if p]
     found = [root / kind for root in (own, Path.cwd(), *extra)] + [p for p in extra if p.is_dir()]
     return list(dict.fromkeys(p.resolve() for p in found if p.is_dir()))
@@ -118,9 +125,9 @@ def _kind_of(path: Path) -> str | None:
         return path.parent.name
     text = path.read_text(encoding="utf-8", errors="replace")
     for kind, (module, base) in BASES.items():
-        last = module.rpartition(".")[2]
+        package, _, last = module.rpartition(".")
         imports = (
-            rf"^\s*(from\s+{module}\b|import\s+{module}\b|from\s+mtl_bench\s+import\s+{last}\b)"
+            rf"^\s*(from\s+{module}\b|import\s+{module}\b|from\s+{package}\s+import\s+{last}\b)"
         )
         if re.search(imports, text, re.MULTILINE) and base in text:
             return kind
@@ -172,6 +179,36 @@ def _installed(package: str) -> bool:
     return package in sys.modules or importlib.util.find_spec(package) is not None
 
 
+def attributes(kind: str, name: str) -> dict[str, Any]:
+    """Class attributes of a plug-in's file that have a literal value, without importing it.
+
+    Raises:
+        ValueError: an unknown or ambiguous name.
+    """
+    return dict(_attributes(path_of(kind, name).read_bytes()))
+
+
+@functools.cache
+def _attributes(text: bytes) -> Mapping[str, Any]:
+    found: dict[str, Any] = {}
+    classes = (node for node in ast.parse(text).body if isinstance(node, ast.ClassDef))
+    for item in itertools.chain.from_iterable(node.body for node in classes):
+        targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
+        if isinstance(item, (ast.Assign, ast.AnnAssign)) and item.value is not None:
+            with contextlib.suppress(ValueError):  # not a literal
+                found |= {ast.unparse(t): ast.literal_eval(item.value) for t in targets if t}
+    return found
+
+
+def lack(packages: Iterable[str], extra: Iterable[str]) -> str | None:
+    """Which of the packages are not installed here, and how to install them; None: all are."""
+    lacking = [package for package in packages if importlib.util.find_spec(package) is None]
+    if not lacking:
+        return None
+    words = " ".join(f"'{word}'" for word in extra)
+    return f"lacks the package {', '.join(lacking)}" + (f": pip install {words}" if words else "")
+
+
 # --- loading --------------------------------------------------------------------------------------
 
 
@@ -180,7 +217,7 @@ def load(kind: str, name: str) -> type[Any]:
 
     Raises:
         ValueError: unknown or ambiguous name, a file that fails to import (with its line), or one
-            that does not define exactly one subclass of `Method` (`Backbone`).
+            that does not define exactly one subclass of `Method` (`Backbone`, `Engine`).
     """
     path = path_of(kind, name)
     base_module, base_name = BASES[kind]

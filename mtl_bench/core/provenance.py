@@ -38,7 +38,8 @@ HARNESS = (  # what numbers depend on; the rest launches, stores or shows
     "evaluate.py",
     "pseudo_frames.py",
     "pseudo_labels.py",
-    "latency.py",
+    "deploy/timer.py",
+    "deploy/maps.py",
 )
 PACKAGES = (
     "mtl-bench",

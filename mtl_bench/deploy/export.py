@@ -17,7 +17,13 @@ Outputs without it, as MGNet's exported graph has them (but for center, which is
 belongs to a task that the model lacks is absent. Metadata: classes, things, size, layout, cell id.
 """
 
+import contextlib
 import json
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -26,54 +32,46 @@ from torch import Tensor, nn
 
 from mtl_bench import __version__
 from mtl_bench.core import config
+from mtl_bench.core.engine import Setting
 from mtl_bench.data.labels import LabelSet
-from mtl_bench.engines import onnx_file
-from mtl_bench.engines.graph import Strided, strided
+from mtl_bench.deploy import maps
+from mtl_bench.deploy.graph import Strided, strided
+from mtl_bench.deploy.maps import MAPS
 from mtl_bench.tasks.finish import Finish
 
 POST = ("inside", "apart", "none")
-MAPS = {"logits": "semantic", "center": "center", "offset": "offset", "inverse": "inverse_depth"}
-CAMERA = ("K", "camera_height_m", "pitch_rad")
-RESULTS = {"panoptic": ("panoptic",), "depth": ("depth_m", "points")}
-EGO_AND_SKY = ("ego vehicle", "sky")
+OPSET = 20
 
 
 class FullSize(nn.Module):
-    """The strided graph, and its maps at the image's size."""
+    """The strided graph, and its maps at the image's size; of classes only their index."""
 
     def __init__(self, strided: Strided, size: tuple[int, int]):
         super().__init__()
         self.strided, self.size = strided, size  # `graph` is a name that torch.fx uses
 
     def forward(self, image_1HW3: Tensor) -> tuple[Tensor, ...]:
-        maps = [
+        found = [
             F.interpolate(x, self.size, mode="bilinear", align_corners=True)
             for x in self.strided(image_1HW3)
         ]
-        if "logits" in self.strided.names:
-            maps[0] = maps[0].argmax(1).int()
-        return tuple(maps)
+        return tuple(
+            map_.argmax(1).int() if MAPS[name].reduced else map_
+            for name, map_ in zip(self.strided.names, found, strict=True)
+        )
 
 
 class Post(nn.Module):
-    """`Finish` with its inputs by position: maps in the order of MAPS, then the camera."""
+    """`Finish` with its inputs by position: the maps, then the camera."""
 
-    def __init__(self, finish: Finish, names: list[str]):
+    def __init__(self, finish: Finish, names: list[str], camera: list[str]):
         super().__init__()
-        self.finish, self.names = finish, names
+        self.finish, self.names, self.camera = finish, names, camera
 
     def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
-        given = dict(zip(self.names, values, strict=True))
-        found = self.finish(
-            given.get("semantic"),
-            given.get("center"),
-            given.get("offset"),
-            given.get("inverse_depth"),
-            given.get("K"),
-            given.get("camera_height_m"),
-            given.get("pitch_rad"),
-        )
-        return tuple(found[name] for names in RESULTS.values() for name in names if name in found)
+        given = dict(zip([*self.names, *self.camera], values, strict=True))
+        found = maps.finished(self.finish, given)
+        return tuple(found[name] for name in maps.results_of(self.names))
 
 
 class Whole(nn.Module):
@@ -110,40 +108,83 @@ def export(
     if post not in POST:
         raise ValueError(f"--post '{post}' is none of {', '.join(POST)}")
     graph = strided(net, (1, *size))
-    maps = FullSize(graph, size)
-    names = [MAPS[name] for name in graph.names]
-    camera = list(CAMERA) if "inverse_depth" in names else []
-    finish = Post(_finish(labels, evaluate), names + camera)
-    results = [*(RESULTS["panoptic"] if "semantic" in names else ())]
-    results += RESULTS["depth"] if camera else ()
+    full = FullSize(graph, size)
+    names = [MAPS[name].exported for name in graph.names]
+    camera = maps.camera_of(graph.names, size)
+    finish = Post(maps.finish_of(labels, evaluate), graph.names, list(camera))
+    results = maps.results_of(graph.names)
     image = {"image": torch.randint(0, 256, (1, *size, 3), dtype=torch.uint8)}
     about = _about(labels, size, post) | (metadata or {})
     path.parent.mkdir(parents=True, exist_ok=True)
     if post == "inside":
-        onnx_file.write(Whole(maps, finish), image | _camera(camera, size), results, path, about)
+        write(Whole(full, finish), image | camera, results, path, about)
         return [path]
-    onnx_file.write(maps, image, names, path, about)
+    write(full, image, names, path, about)
     if post == "none":
         return [path]
     with torch.no_grad():
-        found = dict(zip(names, maps(image["image"]), strict=True))
+        found = dict(zip(names, full(image["image"]), strict=True))
     second = path.with_suffix(".post.onnx")
-    onnx_file.write(finish, found | _camera(camera, size), results, second, about)
+    write(finish, found | camera, results, second, about)
     return [path, second]
 
 
-def _finish(labels: LabelSet, evaluate: config.Evaluate) -> Finish:
-    known = [label.name for label in labels.labels]
-    without = tuple(labels.index(name) for name in EGO_AND_SKY if name in known)
-    return Finish(labels.things, labels.index("road"), evaluate, without).eval()
+@contextlib.contextmanager
+def strided_file(net: nn.Module, setting: Setting) -> Iterator[tuple[Path, list[str]]]:
+    """For engines: the strided graph as a temporary ONNX file in float32; its path and outputs."""
+    graph = strided(net, (setting.batch, *setting.size))
+    image_BHW3 = torch.zeros(
+        setting.batch, *setting.size, 3, dtype=torch.uint8, device=setting.device
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "strided.onnx"
+        write(graph, {"image": image_BHW3}, graph.names, path)
+        yield path, graph.names
 
 
-def _camera(names: list[str], size: tuple[int, int]) -> dict[str, Tensor]:
-    """An example: a camera of 90 degrees, 1.4 m above the road."""
-    height, width = size
-    K_33 = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]])
-    values = {"K": K_33[None], "camera_height_m": torch.tensor([1.4]), "pitch_rad": torch.zeros(1)}
-    return {name: values[name].float() for name in names}
+def write(
+    module: nn.Module,
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+    path: Path,
+    metadata: Mapping[str, str] | None = None,
+) -> None:
+    """Write a module as an ONNX file, which has its name once it is whole and sound.
+
+    Args:
+        inputs: names and examples, in the order of the module's arguments.
+        outputs: names, in the order of its results.
+        metadata: goes into the file's metadata_props.
+
+    Raises:
+        ValueError: the package onnx is missing.
+    """
+    try:
+        import onnx
+        import onnxscript  # noqa: F401  (torch.onnx needs it)
+    except ImportError as error:
+        raise ValueError(
+            f"ONNX files need the package {error.name}: pip install 'mtl-bench[onnx]'"
+        ) from None
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")  # of the exporter about itself
+        program = torch.onnx.export(
+            module,
+            tuple(inputs.values()),
+            dynamo=True,
+            opset_version=OPSET,
+            input_names=list(inputs),
+            output_names=list(outputs),
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    onnx.helper.set_model_props(model, dict(metadata or {}))
+    onnx.checker.check_model(model, full_check=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    onnx.save(model, str(temporary))
+    temporary.replace(path)
 
 
 def _about(labels: LabelSet, size: tuple[int, int], post: str) -> dict[str, str]:
