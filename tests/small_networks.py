@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from mtl_bench.core import config
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.engines.scene import Camera, Subject
+from mtl_bench.deploy.maps import Camera
+from mtl_bench.deploy.subject import Subject
 from mtl_bench.model import Model, build_model
 
 SIZE = (64, 128)

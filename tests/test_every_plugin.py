@@ -1,16 +1,19 @@
-"""Every file in methods/ and backbones/ passes the checks that come with being there."""
+"""Every file in methods/, backbones/ and engines/ passes the checks that come with being there."""
 
 import pytest
 
 from mtl_bench.bench.check import check
 from mtl_bench.core import plugins
 
-PLUGINS = [(kind, name) for kind in plugins.KINDS for name in plugins.files(kind)]
+SLOW = [("engines", "compile")]  # a compiler's run for every precision
+PLUGINS = [
+    pytest.param(kind, name, id=f"{kind}-{name}", marks=[pytest.mark.slow] * ((kind, name) in SLOW))
+    for kind in plugins.KINDS
+    for name in plugins.files(kind)
+]
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), PLUGINS, ids=[f"{kind}-{name}" for kind, name in PLUGINS]
-)
+@pytest.mark.parametrize(("kind", "name"), PLUGINS)
 def test_plugin(kind, name):
     failed = [f"{result.name}: {result.detail}" for result in check(kind, name) if not result.ok]
     assert failed == []

@@ -14,11 +14,15 @@ import fake_latency
 import pytest
 from typer.testing import CliRunner
 
-from mtl_bench import engines
 from mtl_bench.bench import claim, grid_file, latency_grid, latency_runs, results, timing
 from mtl_bench.bench.timing import Timing
 from mtl_bench.cli.app import app
+<<<<<<< HEAD
 from mtl_bench.core import config, fingerprint
+=======
+from mtl_bench.core import config, provenance
+from mtl_bench.deploy import engines
+>>>>>>> cd21242dbf68b6ea5828e41f3c03310c2f0eb8f5
 
 FAKE = Path(__file__).with_name("fake_timing.py")
 GRID = """kind = "latency"
@@ -60,7 +64,7 @@ def test_the_shipped_grid_has_what_the_paper_deploys():
     assert grid.question.endswith("?")
     assert {t.size for t in grid.timings} == {"384x1280", "512x1024", "1024x2048"}
     assert {t.tasks for t in grid.timings} == {("panoptic",), ("panoptic", "depth")}
-    assert {t.engine for t in grid.timings} == set(engines.NAMES)
+    assert {t.engine for t in grid.timings} == set(engines.names())
     assert len({t.backbone for t in grid.timings}) == 4
     assert {(t.passes, t.recipe, t.weights) for t in grid.timings} == {(500, "paper", None)}
     assert len({t.id for t in grid.timings}) == len(grid.timings)

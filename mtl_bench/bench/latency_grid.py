@@ -39,12 +39,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from mtl_bench import engines
 from mtl_bench.bench import grid_file, results
 from mtl_bench.bench.timing import Timing, recipe_of
+from mtl_bench.core import plugins
 from mtl_bench.core.config import Recipe
 from mtl_bench.core.plain import did_you_mean, from_dict, to_dict
 from mtl_bench.core.toml_file import TomlFile
+from mtl_bench.deploy import engines
 
 AXES = ("backbone", "size", "tasks", "engine", "precision")
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -216,7 +217,9 @@ def _with_weights(timing: Timing, weights: Mapping[str, str]) -> Timing:
 
 def _without_precision(timing: Timing) -> str | None:
     """Why it is skipped; an engine that the kind of device lacks keeps one line, in fp32."""
-    has = engines.PRECISIONS.get(timing.engine, {timing.device: (timing.precision,)})
+    if timing.engine not in plugins.files("engines"):
+        return None  # `timing.check` says so
+    has = engines.facts(timing.engine).precisions
     if timing.precision in has.get(timing.device, ("fp32",)):
         return None
     return f"{timing.engine} has no {timing.precision} on {timing.device}"

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from mtl_bench import engines
 from mtl_bench.bench import claim, launch, results
 from mtl_bench.bench.timing import Timing
 from mtl_bench.core import provenance
@@ -261,14 +260,13 @@ def _neighbours(runs: Path) -> bool:
 
 def roots(timing: Timing) -> list[Root]:
     """Of its network and frames only shapes count: training and data sets do not."""
-    module, engine = engines.CLASSES[timing.engine]
     return [
         provenance.backbone_root(timing.backbone),
-        Root(of_package("engines.timed"), ("row",)),
-        Root(of_package(f"engines.{module}"), (engine,)),
-        Root(of_package("deploy"), ("name_classes", "_camera", "_only")),
-        Root(of_package("latency"), ("prepare",)),
-        Root(of_package("model"), ("build_model", "side_by_side")),
+        provenance.plugin_root("engines", timing.engine),
+        *(provenance.plugin_root("tasks", task) for task in timing.tasks),
+        Root(of_package("deploy.timer"), ("row",)),
+        Root(of_package("deploy.subject"), ("subject",)),
+        Root(of_package("model.network"), ("build_model", "side_by_side")),
     ]
 
 

@@ -89,11 +89,39 @@ class {title}(Backbone):
         return {{stride: found[stride] for stride in self.channels}}
 '''
 
-TEMPLATES = {"methods": METHOD, "backbones": BACKBONE}
+ENGINE = '''"""{title}: one line that `mtl-bench list` shows.
+
+Source: the package that it runs. Then what has to be known about it.
+"""
+
+from torch import Tensor, nn
+
+from mtl_bench.core.engine import Setting
+from mtl_bench.deploy.graph import GraphEngine, strided
+
+
+# For an engine that reads ONNX files, mtl_bench.deploy.export.strided_file writes one.
+class {title}(GraphEngine):
+    """The graph, run by torch."""
+
+    precisions = {{"cpu": ("fp32",), "cuda": ("fp32",)}}  # by kind of device: fp32, bf16, fp16
+    # packages = ("mine",)  # that `build` imports, where it is more than torch
+    # extra = ("mine>=1.0",)  # what to pip install where they are missing
+
+    def build(self, net: nn.Module, setting: Setting) -> None:
+        """Prepare everything for images of this size, in this precision, on this device."""
+        self.graph = strided(net, (setting.batch, *setting.size), setting.dtype)
+
+    def strided(self, image: Tensor) -> dict[str, Tensor]:
+        """Image uint8 [B,H,W,3] -> the graph's maps at its finest stride, float32, by name."""
+        return dict(zip(self.graph.names, self.graph(image), strict=True))
+'''
+
+TEMPLATES = {"methods": METHOD, "backbones": BACKBONE, "engines": ENGINE}
 
 
 def write(kind: str, name: str, folder: Path | None = None) -> Path:
-    """Write the scaffold of a plug-in, into `./methods` or `./backbones` unless told otherwise.
+    """Write the scaffold of a plug-in, into `./methods` (`./backbones`, `./engines`) unless told.
 
     Raises:
         ValueError: an impossible or taken name.

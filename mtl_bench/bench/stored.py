@@ -17,8 +17,8 @@ from mtl_bench.core.quiet import SIDE_BY_SIDE, Quiet
 from mtl_bench.core.task import Results
 from mtl_bench.data.loader import eval_batches
 from mtl_bench.data.samples import open_samples
+from mtl_bench.deploy.timer import measure
 from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, predict, true_size
-from mtl_bench.latency import measure
 from mtl_bench.model import Model, side_by_side
 from mtl_bench.train import checkpoint
 from mtl_bench.train.loop import CHECKPOINT, build
@@ -91,6 +91,28 @@ def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
         why = str(error).splitlines()[1].strip()
         raise ValueError(f"{path} is not of this cell's model: {why}") from None
     return model
+
+
+def deployed(path: Path, tasks: tuple[str, ...] | None) -> tuple[Cell, Model]:
+    """A trained cell and its model, as it is deployed.
+
+    Args:
+        path: a run's folder, or its checkpoint.
+        tasks: leave only these; None: all that it was trained for.
+
+    Raises:
+        ValueError: no checkpoint there, or it has not been trained for a task.
+    """
+    if not path.exists():
+        raise ValueError(f"no run or checkpoint '{path}'")
+    weights = path / CHECKPOINT if path.is_dir() else path
+    cell = results.load_cell(weights.parent / "cell.json")
+    model = load_model(cell, weights, Engine(torch.device("cpu")))
+    lacking = [task for task in tasks or () if task not in cell.tasks]
+    if lacking:
+        raise ValueError(f"{path} is trained for {', '.join(cell.tasks)}, not for {lacking[0]}")
+    model.keep(tasks or cell.tasks)
+    return cell, model
 
 
 def time_cell(

@@ -9,11 +9,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from mtl_bench import engines
 from mtl_bench.bench import results
 from mtl_bench.core import plugins
 from mtl_bench.core.config import Recipe, load_recipe
 from mtl_bench.core.plain import did_you_mean, to_dict
+from mtl_bench.deploy import engines
 
 PROTOCOL = 1  # raised when times taken before stop being comparable with times taken after
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -99,9 +99,7 @@ def check(timings: Iterable[Timing]) -> None:
         ValueError: an unknown one, with the nearest known one.
     """
     for timing in timings:
-        if timing.engine not in engines.NAMES:
-            hint = did_you_mean(timing.engine, engines.NAMES)
-            raise ValueError(f"no engine called '{timing.engine}'{hint}")
+        plugins.path_of("engines", timing.engine)
         for task in timing.tasks:
             plugins.path_of("tasks", task)
         plugins.path_of("backbones", timing.backbone)

@@ -10,8 +10,10 @@ from dataclasses import replace
 from mtl_bench.core import plugins
 from mtl_bench.core.columns import Column
 
-ALLOWED = (ast.Call, ast.Name, ast.Starred, ast.Tuple, ast.keyword, ast.Constant, ast.UnaryOp)
-ALLOWED += (ast.UAdd, ast.USub, ast.Load)
+ALLOWED = (
+    *(ast.Call, ast.Name, ast.Starred, ast.Tuple, ast.keyword, ast.Constant, ast.UnaryOp),
+    *(ast.UAdd, ast.USub, ast.Load),
+)
 
 
 def quality() -> tuple[Column, ...]:

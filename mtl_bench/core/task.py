@@ -8,6 +8,7 @@ Shapes: B images, H x W input pixels, h x w cells of the finest feature map.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -30,6 +31,25 @@ Maps = dict[str, Tensor]  # by name, [B,C,H,W]
 Results = dict[str, Tensor]  # by name, the first axis is B
 Size = tuple[int, int]  # height, width
 Frame = Mapping[str, Any]  # one frame's arrays, by name
+
+
+@dataclass(frozen=True)
+class MapInfo:
+    """What a map is to engines and exported files.
+
+    Attributes:
+        exported: its name in an exported file.
+        classes: whether post-processing reads nothing but the index of its largest channel.
+        words: what its differences are called, where engines are compared.
+        ids: the result that holds ids of what these classes are; engines have to agree on them.
+        quantity: what this map is the inverse of; engines have to agree on it by ratio.
+    """
+
+    exported: str
+    classes: bool = False
+    words: str = ""
+    ids: str = ""
+    quantity: str = ""
 
 
 class TaskHead(nn.Module):
@@ -115,7 +135,10 @@ class Task:
     truth: ClassVar[frozenset[str]] = frozenset()  # fields of an evaluation sample
     after: ClassVar[tuple[str, ...]] = ()  # tasks whose results `finish` may read
     columns: ClassVar[tuple[Column, ...]] = ()  # of its metrics
-    categorical: ClassVar[frozenset[str]] = frozenset()  # maps of which `finish` reads the argmax
+    maps: ClassVar[Mapping[str, MapInfo]] = {}  # that `finish` reads, by the head's names
+    exported: ClassVar[tuple[str, ...]] = ()  # results that an exported file gives
+    has_points: ClassVar[bool] = False  # whether `points` gives any
+    reads_camera: ClassVar[bool] = False  # whether `finish` or `points` does
     makes_labels: ClassVar[bool] = False  # whether the video stage's labels come from it
     averages_flip: ClassVar[bool] = False  # whether `flip_averaged` does anything
     # Which of a task's members make the numbers of each stage; the others make none
@@ -143,7 +166,7 @@ class Task:
             "finish",
             "metrics",
         ),
-        "time": ("after", "categorical", "head", "activate", "finish", "points"),
+        "time": ("after", "maps", "head", "activate", "finish", "points"),
         "label": ("head", "activate", "resized", "label"),
         "show": (
             "name",
@@ -154,6 +177,10 @@ class Task:
             "trivial",
             "pictures",
             "write_results",
+            "exported",
+            "reads_camera",
+            "has_points",
+            "like_trained",
         ),
     }
 
@@ -225,8 +252,15 @@ class Task:
         """
         raise NotImplementedError
 
+    def like_trained(self, head: TaskHead, maps: Maps) -> None:
+        """Give random weights what the time of post-processing depends on.
+
+        Args:
+            maps: that they predict, at the input's size.
+        """
+
     def points(self, results: Mapping[str, Results], camera: Camera) -> Tensor | None:
-        """3D points [B,3,H,W] in the camera's frame, metres, NaN where there is none."""
+        """Where `has_points`: 3D points [B,3,H,W] in the camera's frame, metres, NaN for none."""
         return None
 
     def metrics(self, split: str | None = None) -> list[Metric]:

@@ -8,7 +8,7 @@ medians (it looks at the truth), `depth_dgc` by the camera's height above the gr
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from mtl_bench.core.dataset import NEIGHBOURS, Dataset
 from mtl_bench.core.geometry import back_project, depth_from_inverse
 from mtl_bench.core.labels import GROUND, NO_SURFACE
 from mtl_bench.core.recipe import Evaluate, Network
-from mtl_bench.core.task import Frame, Maps, Metric, Results, Size, Task, TaskHead, Trivial
+from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
 from mtl_bench.model.layers import Decoder, Head, full
 from mtl_bench.tasks import pixels
@@ -69,6 +69,10 @@ class Depth(Task):
     truth = frozenset({"depth_m"})
     after = ("panoptic",)  # the ground, which the scale is taken from
     averages_flip = True
+    maps: ClassVar[Mapping[str, MapInfo]] = {"inverse": MapInfo("inverse_depth", quantity="depth")}
+    exported = ("depth_m",)
+    has_points = True
+    reads_camera = True
     columns = (
         Column(
             *("abs_rel", "depth_median.abs_rel", "AbsRel", -1, 3),

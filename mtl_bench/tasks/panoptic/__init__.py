@@ -6,7 +6,7 @@ Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021) after Panoptic-DeepLab (C
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from mtl_bench.core.columns import Column
 from mtl_bench.core.dataset import LabelFrames
 from mtl_bench.core.labels import IGNORE, LabelSet, class_of_instance_id
 from mtl_bench.core.recipe import Network, Recipe
-from mtl_bench.core.task import Frame, Maps, Metric, Results, Size, Task, TaskHead, Trivial
+from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
 from mtl_bench.model.layers import Decoder, Head, full, init_fan_in
 from mtl_bench.tasks.panoptic import grouping, pseudo_labels
@@ -27,6 +27,8 @@ from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_l
 from mtl_bench.tasks.panoptic.metrics import PanopticQuality, SemanticIoU
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 from mtl_bench.tasks.pixels import sampled
+
+THINGS_SHARE = 0.1  # of the pixels of a street scene; Cityscapes' is a bit less
 
 
 class PanopticHead(TaskHead):
@@ -64,7 +66,12 @@ class Panoptic(Task):
     kind = "classification"
     needs = frozenset({"instance_ids"})
     truth = frozenset({"instance_ids"})
-    categorical = frozenset({"semantic"})
+    maps: ClassVar[Mapping[str, MapInfo]] = {
+        "semantic": MapInfo("semantic", classes=True, words="logits", ids="panoptic"),
+        "center": MapInfo("center"),
+        "offset": MapInfo("offset"),
+    }
+    exported = ("panoptic",)
     makes_labels = True
     columns = (
         Column(
@@ -91,6 +98,25 @@ class Panoptic(Task):
             "center": maps["center"].sigmoid(),
             "offset": maps["offset"] * cell,
         }
+
+    def like_trained(self, head: TaskHead, maps: Maps) -> None:
+        """Give the classes new numbers: things then cover no more of an image than in a street,
+        which is what the time of grouping depends on. Weights drawn in another order are as random.
+        """
+        things, classes = self.labels.things, maps["semantic"].shape[1]
+        share_C = torch.bincount(maps["semantic"].argmax(1).flatten(), minlength=classes) / 1.0
+        share_C /= share_C.sum()
+        chosen: list[int] = []
+        for number in share_C.argsort(descending=True).tolist():
+            fits = share_C[[*chosen, number]].sum() <= THINGS_SHARE
+            chosen += [number] if fits and len(chosen) < len(things) else []
+        rest = [n for n in share_C.argsort().tolist() if n not in chosen]
+        chosen += rest[: len(things) - len(chosen)]
+        others = iter([number for number in range(classes) if number not in chosen])
+        taken = iter(chosen)
+        order = [next(taken if number in things else others) for number in range(classes)]
+        last: Any = head.heads["semantic"][1]  # type: ignore[index]
+        last.weight.data = last.weight.data[order].clone()
 
     # --- training ---------------------------------------------------------------------------------
 

@@ -1,36 +1,38 @@
 """TensorRT on CUDA, from an ONNX file; its buffers are torch's, so nothing leaves the device.
 
-Written after TensorRT 10's documentation; it has not run on a GPU yet.
+Source: TensorRT 10's documentation; it has not run on a GPU yet.
 """
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.engines.base import Setting, StridedEngine
-from mtl_bench.engines.onnx_runtime import write_strided
+from mtl_bench.core.engine import Setting
+from mtl_bench.deploy.export import strided_file
+from mtl_bench.deploy.graph import GraphEngine
 
 FLAGS = {"fp32": (), "bf16": ("BF16",), "fp16": ("FP16",)}
 
 
-class TensorRt(StridedEngine):
-    """Raises:
-    ValueError: TensorRT cannot read the graph or build it.
-    """
+class TensorRt(GraphEngine):
+    precisions = {"cuda": ("fp32", "bf16", "fp16")}
+    packages = ("tensorrt", "onnx", "onnxscript")
+    extra = ("mtl-bench[onnx]", "tensorrt")
 
-    package = "tensorrt"
+    @classmethod
+    def lack(cls) -> str | None:
+        gpu = torch.cuda.is_available()
+        lacking = None if gpu else "needs an NVIDIA GPU, and torch sees no CUDA device here"
+        return super().lack() or lacking
 
-    def __init__(self, net: nn.Module, setting: Setting):
-        super().__init__(net, setting)
+    def build(self, net: nn.Module, setting: Setting) -> None:
         import tensorrt
 
         logger = tensorrt.Logger(tensorrt.Logger.ERROR)
-        with tempfile.TemporaryDirectory() as folder:
-            path, self.names = write_strided(net, setting, Path(folder))
-            plan = _build(tensorrt, logger, path, setting.precision)
+        with strided_file(net, setting) as (path, self.names):
+            plan = _plan(tensorrt, logger, path, setting.precision)
         self._engine = tensorrt.Runtime(logger).deserialize_cuda_engine(plan)
         self._context = self._engine.create_execution_context()
         self._stream = torch.cuda.Stream(setting.device)
@@ -49,7 +51,12 @@ class TensorRt(StridedEngine):
         return self._out
 
 
-def _build(tensorrt: Any, logger: Any, path: Path, precision: str) -> Any:
+def _plan(tensorrt: Any, logger: Any, path: Path, precision: str) -> Any:
+    """The engine as TensorRT writes it.
+
+    Raises:
+        ValueError: TensorRT cannot read the graph or build it.
+    """
     builder = tensorrt.Builder(logger)
     network = builder.create_network(0)
     parser = tensorrt.OnnxParser(network, logger)

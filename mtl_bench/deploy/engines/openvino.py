@@ -1,29 +1,25 @@
 """OpenVINO on the CPU, in the precision that was asked for and no other.
 
-Its own default on a CPU with AMX is bf16, which is not what "fp32" means.
+Source: the package openvino; the graph is an ONNX file in float32. Its own default on a CPU with
+AMX is bf16, which is not what "fp32" means.
 """
-
-import tempfile
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.engines.base import Setting, StridedEngine
-from mtl_bench.engines.onnx_runtime import write_strided
+from mtl_bench.core.engine import Setting
+from mtl_bench.deploy.export import strided_file
+from mtl_bench.deploy.graph import GraphEngine
 
 HINTS = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
 
 
-class OpenVino(StridedEngine):
-    """Raises:
-    ValueError: this CPU does not compute in the precision.
-    """
+class OpenVino(GraphEngine):
+    precisions = {"cpu": ("fp32", "bf16", "fp16")}
+    packages = ("openvino", "onnx", "onnxscript")
+    extra = ("mtl-bench[onnx,openvino]",)
 
-    package = "openvino"
-
-    def __init__(self, net: nn.Module, setting: Setting):
-        super().__init__(net, setting)
+    def build(self, net: nn.Module, setting: Setting) -> None:
         import openvino
 
         hint = HINTS[setting.precision]
@@ -32,8 +28,7 @@ class OpenVino(StridedEngine):
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_NUM_THREADS": setting.threads,
         }
-        with tempfile.TemporaryDirectory() as folder:
-            path, self.names = write_strided(net, setting, Path(folder))
+        with strided_file(net, setting) as (path, self.names):
             core = openvino.Core()
             compiled = core.compile_model(core.read_model(path), "CPU", options)
         chosen = compiled.get_property("INFERENCE_PRECISION_HINT").to_string()
@@ -45,7 +40,4 @@ class OpenVino(StridedEngine):
 
     def strided(self, image: Tensor) -> dict[str, Tensor]:
         found = self.request.infer({"image": image.numpy()}, share_inputs=True, share_outputs=True)
-        arrays = (found[number] for number in range(len(self.names)))
-        return {
-            name: torch.from_numpy(array) for name, array in zip(self.names, arrays, strict=True)
-        }
+        return {name: torch.from_numpy(found[n]) for n, name in enumerate(self.names)}
