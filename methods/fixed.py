@@ -11,9 +11,9 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.plain import did_you_mean
-from mtl_bench.core.terms import TASK_KINDS, TERMS, Term
+from mtl_bench.core.terms import Term
 
 PRIORS = ("paper", "equal")
 
@@ -41,7 +41,7 @@ class Fixed(LossMethod):
         super().__init__(terms, seed)
         if prior not in PRIORS:
             raise ValueError(f"no prior called '{prior}'{did_you_mean(prior, PRIORS)}")
-        known = {*TASK_KINDS, *(term.name for term in (*TERMS, *terms))}
+        known = {name for term in terms for name in (term.name, term.task)}
         for name in weights:
             if name not in known:
                 raise ValueError(f"no loss called '{name}' to weigh{did_you_mean(name, known)}")
@@ -49,5 +49,5 @@ class Fixed(LossMethod):
         weight = [float(weights.get(name, start[name])) for name in start]
         self.register_buffer("weight_T", torch.tensor(weight), persistent=False)
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        return (self.weight_T[self.present] * loss_K).sum()
+    def total(self, step: Step) -> Tensor:
+        return (self.weight_T[step.present] * step.loss_K).sum()

@@ -29,7 +29,8 @@ class Broken(LossMethod):
         super().__init__(terms, seed)
         self.count = 0
 
-    def total(self, loss_K):
+    def total(self, step):
+        loss_K = step.loss_K
         self.count += 1
         {line}
 '''
@@ -43,7 +44,8 @@ from mtl_bench.core.method import GradientMethod
 
 
 class Broken(GradientMethod):
-    def weights(self, G_KK, loss_K):
+    def weights(self, G_KK, step):
+        loss_K = step.loss_K
         {line}
 '''
 
