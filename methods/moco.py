@@ -15,7 +15,7 @@ from torch import Tensor
 from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
-from ._simplex import descend
+from ._solvers import descend
 from ._state import Rows
 
 

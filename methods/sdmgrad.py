@@ -15,8 +15,7 @@ from torch import Tensor
 from mtl_bench.core.method import CrossMethod, Step
 from mtl_bench.core.terms import Term
 
-from ._simplex import descend
-from ._solvers import project_on_simplex
+from ._solvers import descend, project_on_simplex
 
 
 class SDMGrad(CrossMethod):

@@ -101,9 +101,10 @@ def backward(
         (method.loss, method.gradient) if isinstance(method, Composed) else (None, method)
     )
     assert isinstance(second, GradientMethod)
+    step = _ByGradients(first, second, model, scale)
     if isinstance(second, CrossMethod):
-        return _by_cross_products(first, second, batches, model, scale, cosines)
-    return _by_gradients(first, second, batches, model, scale, lr, cosines)
+        return step.on_three_batches(batches, cosines)
+    return step.on_one_batch(batches, lr, cosines)
 
 
 def reevaluate(method: Method, step: Step, parts: Sequence[Forward], model: Split) -> None:
@@ -222,187 +223,6 @@ def _measured(losses: Mapping[str, Tensor], z: list[Tensor], model: Split) -> di
 # --- gradient methods -----------------------------------------------------------------------------
 
 
-def _by_gradients(
-    first: LossMethod | None,
-    method: GradientMethod,
-    batches: Sequence[Sequence[Forward]],
-    model: Split,
-    scale: float,
-    lr: float,
-    cosines: bool,
-) -> Weighting:
-    """Every loss's gradient, then the method's answer."""
-    seen = _task_gradients(method, batches[0], model, scale)
-    first_K = _first_weights(first, seen.step, scale)
-    step = replace(seen.step, loss_K=first_K * seen.step.loss_K)
-    measured = cosines_of(seen.names, seen.rows) if cosines else {}
-    if isinstance(seen.gradients, Matrix):
-        J_KP, look = seen.gradients.J_KP, None
-        if first is not None:
-            J_KP *= first_K[:, None]
-        if isinstance(method, LookAheadMethod):
-            look = _look_ahead(method, batches[1], model, first_K, step.present, lr)
-        direction_P, weight_K = _direction(method, J_KP, step, look, lr)
-        seen.gradients.back(unflatten(direction_P * scale, seen.gradients.shared))
-    else:
-        weight_K = _weights(method, products(seen.rows, seen.rows), first_K, step)
-        seen.gradients.back(combine(first_K * weight_K * scale, seen.rows))
-    own = trainable(model.task_parameters())
-    _add_own(own, seen.own, seen.names, first_K * _head_weights(method, weight_K, step))
-    return _weighting(method, seen.losses, seen.step, first_K * weight_K, measured)
-
-
-def _by_cross_products(
-    first: LossMethod | None,
-    method: CrossMethod,
-    batches: Sequence[Sequence[Forward]],
-    model: Split,
-    scale: float,
-    cosines: bool,
-) -> Weighting:
-    """Gradients of two batches for the weights, one weighted pass of a third for the update.
-
-    Raises:
-        ValueError: the two batches have no loss in common.
-    """
-    seen = [_task_gradients(method, parts, model, scale, own=False) for parts in batches[:2]]
-    names = [name for name in seen[0].names if name in seen[1].names]
-    if not names:
-        raise ValueError(f"{type(method).__name__} compares batches, and they share no labels")
-    places = [[one.names.index(name) for name in names] for one in seen]
-    rows = [[one.rows[i] for i in place] for one, place in zip(seen, places, strict=True)]
-    loss_K, other_K = (one.step.loss_K[place] for one, place in zip(seen, places, strict=True))
-    plain = Step((loss_K + other_K) / 2, seen[0].step.present[places[0]])
-    first_K = _first_weights(first, plain, scale)
-    step = replace(plain, loss_K=first_K * plain.loss_K)
-    measured = cosines_of(names, rows[0]) if cosines else {}
-    weight_K = _weights(method, products(*rows), first_K, step)
-    head_K = first_K * _head_weights(method, weight_K, step)
-    weight_K = first_K * weight_K
-    del seen, rows  # as large as the network, many times
-    losses = _weighted_pass(method, batches[2], names, weight_K, head_K, model, scale)
-    return _weighting(method, losses, plain, weight_K, measured)
-
-
-def _first_weights(first: LossMethod | None, step: Step, scale: float) -> Tensor:
-    """A composition's loss-value method, asked first; ones without it."""
-    if first is None:
-        return torch.ones_like(step.loss_K)
-    return _differentiate(first, step, scale)[1] / scale
-
-
-def _weights(method: GradientMethod, G_KK: Tensor, first_K: Tensor, step: Step) -> Tensor:
-    """The method's weights [K]; ones where fp16 has overflowed: no state may learn from that."""
-    if not torch.isfinite(G_KK).all():
-        return torch.ones_like(step.loss_K)
-    scale_K = first_K.double().cpu()
-    exact = replace(step, loss_K=step.loss_K.double().cpu())
-    return method.weights(G_KK * scale_K * scale_K[:, None], exact).to(step.loss_K)
-
-
-def _direction(
-    method: GradientMethod,
-    J_KP: Tensor,
-    step: Step,
-    look: Callable[[Tensor], Tensor] | None,
-    lr: float,
-) -> tuple[Tensor, Tensor]:
-    """The method's direction [P] and weights [K]; the sum where fp16 has overflowed."""
-    if not torch.isfinite(J_KP.sum()):
-        return J_KP.sum(0), torch.ones_like(step.loss_K)
-    if look is None:
-        return method.direction(J_KP, step)
-    assert isinstance(method, LookAheadMethod)
-    return method.direction_ahead(J_KP, step, look, lr)
-
-
-def _head_weights(method: GradientMethod, weight_K: Tensor, step: Step) -> Tensor:
-    return (
-        method.head_weights(weight_K, step) if method.weighted_heads else torch.ones_like(weight_K)
-    )
-
-
-def _look_ahead(
-    method: LookAheadMethod,
-    parts: Sequence[Forward],
-    model: Split,
-    first_K: Tensor,
-    present: Tensor,
-    lr: float,
-) -> Callable[[Tensor], Tensor]:
-    """Gives the second batch's gradients where a direction would lead, and leads back."""
-    shared = trainable(model.shared_parameters())
-    first_T = first_K.new_ones(len(method.terms))
-    first_T[present] = first_K
-
-    def look(direction_P: Tensor) -> Tensor:
-        before = [parameter.detach().clone() for parameter in shared]
-        moves = direction_P.split([parameter.numel() for parameter in shared])
-        with torch.no_grad():
-            for parameter, move in zip(shared, moves, strict=True):
-                parameter.sub_(lr * move.view_as(parameter))
-        with frozen_statistics(model):
-            seen = _task_gradients(method, parts, model, 1.0, own=False)
-        with torch.no_grad():
-            for parameter, value in zip(shared, before, strict=True):
-                parameter.copy_(value)
-        assert isinstance(seen.gradients, Matrix)
-        J_KP = seen.gradients.J_KP * first_T[seen.step.present][:, None]
-        return J_KP.nan_to_num(0.0, 0.0, 0.0)  # an overflow there says nothing
-
-    return look
-
-
-def _weighted_pass(
-    method: GradientMethod,
-    parts: Sequence[Forward],
-    names: Sequence[str],
-    weight_K: Tensor,
-    head_K: Tensor,
-    model: Split,
-    scale: float,
-) -> dict[str, Tensor]:
-    """`.grad` of a batch whose losses count `weight` in what is shared, and `head` in the rest.
-
-    Losses without a name here are left out.
-    """
-    shared, own = trainable(model.shared_parameters()), trainable(model.task_parameters())
-    losses, count, passes = _looked_at(method, parts, model)
-    factor_K = torch.tensor([scale / max(count[name], 1) for name in names]).to(weight_K)
-    own_of: dict[str, list[Tensor | None]] = {}
-    total: list[Tensor | None] = [None] * len(shared)
-    for passed in passes:
-        mine, z = gather(passed.losses, method.terms), list(passed.representation)
-        mine = {name: loss for name, loss in mine.items() if name in names}
-        del passed
-        z_grads = _through_decoders(mine, z, own, own_of, 1.0)
-        here = [names.index(name) for name in z_grads]
-        weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))
-        total = add(total, onward(z, weighted, shared, keep=False))
-    for parameter, grad in zip(shared, total, strict=True):
-        parameter.grad = grad
-    _add_own(own, own_of, names, head_K * factor_K)
-    return losses
-
-
-def _add_own(
-    own: Sequence[nn.Parameter],
-    grads_of: Mapping[str, Sequence[Tensor | None]],
-    names: Sequence[str],
-    weight_K: Tensor,
-) -> None:
-    """Weighted gradients of what belongs to one task, into `.grad`."""
-    for name, weight in zip(names, weight_K, strict=True):
-        unit = weight == 1  # most often
-        for parameter, grad in zip(own, grads_of.get(name, ()), strict=False):
-            if grad is not None:
-                grad = grad if unit else grad * weight.to(grad)
-                parameter.grad = grad if parameter.grad is None else parameter.grad + grad
-
-
-# --- gradients of single losses -------------------------------------------------------------------
-
-
 @dataclass
 class _Seen:
     """Of one batch: what a method sees, and what belongs to one task only."""
@@ -415,34 +235,180 @@ class _Seen:
     own: dict[str, list[Tensor | None]]
 
 
-def _task_gradients(
-    method: GradientMethod, parts: Sequence[Forward], model: Split, scale: float, own: bool = True
-) -> _Seen:
-    """Each loss's gradient, averaged over the parts of the batch that have the loss.
+class _ByGradients:
+    """A gradient method's step, behind a loss-value method where two are composed."""
 
-    Args:
-        scale: of the losses before they are differentiated; the results are free of it.
-        own: those of the parameters that are not shared, too.
-    """
-    terms = [term.name for term in method.terms]
-    gradients = KINDS[method.needs](trainable(model.shared_parameters()), terms)
-    others = trainable(model.task_parameters()) if own else []
-    own_of: dict[str, list[Tensor | None]] = {}
-    count: Counter[str] = Counter()
-    seen = []
-    for part in parts:
-        passed = part()
-        seen.append({name: loss.detach() for name, loss in passed.losses.items()})
-        mine, z = gather(passed.losses, method.terms), list(passed.representation)
-        del passed  # which holds the losses, too
-        count.update(mine.keys())
-        gradients.add(z, _through_decoders(mine, z, others, own_of, scale))
-    losses = mean_losses(seen)
-    step = step_of(method, losses)
-    names = _names_of(method, step)
-    rows = gradients.mean({name: scale * count[name] for name in names})
-    means = {name: divided(own_of[name], count[name]) for name in names}
-    return _Seen(losses, step, names, rows, gradients, means)
+    def __init__(
+        self, first: LossMethod | None, method: GradientMethod, model: Split, scale: float
+    ):
+        self.first, self.method, self.model, self.scale = first, method, model, scale
+        self.terms = [term.name for term in method.terms]
+        self.shared = trainable(model.shared_parameters())
+        self.own = trainable(model.task_parameters())
+
+    def on_one_batch(
+        self, batches: Sequence[Sequence[Forward]], lr: float, cosines: bool
+    ) -> Weighting:
+        """Every loss's gradient, then the method's answer."""
+        seen = self._differentiated(batches[0], self.scale, self.own)
+        first_K, step = self._first(seen.step)
+        measured = cosines_of(seen.names, seen.rows) if cosines else {}
+        if isinstance(seen.gradients, Matrix):
+            J_KP = seen.gradients.J_KP
+            if self.first is not None:
+                J_KP *= first_K[:, None]
+            direction_P, weight_K = self._direction(J_KP, first_K, step, batches, lr)
+            seen.gradients.back(unflatten(direction_P * self.scale, self.shared))
+        else:
+            weight_K = self._weights(products(seen.rows, seen.rows), first_K, step)
+            seen.gradients.back(combine(first_K * weight_K * self.scale, seen.rows))
+        self._add_own(seen.own, seen.names, first_K * self._head_weights(weight_K, step))
+        return _weighting(self.method, seen.losses, seen.step, first_K * weight_K, measured)
+
+    def on_three_batches(self, batches: Sequence[Sequence[Forward]], cosines: bool) -> Weighting:
+        """Gradients of two batches for the weights, one weighted pass of a third for the update.
+
+        Raises:
+            ValueError: the two batches have no loss in common.
+        """
+        seen = [self._differentiated(parts, self.scale, []) for parts in batches[:2]]
+        names = [name for name in seen[0].names if name in seen[1].names]
+        if not names:
+            name = type(self.method).__name__
+            raise ValueError(f"{name} compares batches, and they share no labels")
+        places = [[one.names.index(name) for name in names] for one in seen]
+        rows = [[one.rows[i] for i in place] for one, place in zip(seen, places, strict=True)]
+        loss_K, other_K = (one.step.loss_K[place] for one, place in zip(seen, places, strict=True))
+        plain = Step((loss_K + other_K) / 2, seen[0].step.present[places[0]])
+        first_K, step = self._first(plain)
+        measured = cosines_of(names, rows[0]) if cosines else {}
+        weight_K = self._weights(products(*rows), first_K, step)
+        head_K = first_K * self._head_weights(weight_K, step)
+        del seen, rows  # as large as the network, many times
+        losses = self._weighted_pass(batches[2], names, first_K * weight_K, head_K)
+        return _weighting(self.method, losses, plain, first_K * weight_K, measured)
+
+    def _first(self, step: Step) -> tuple[Tensor, Step]:
+        """A composition's loss-value method is asked first: its weights, and the step by them."""
+        if self.first is None:
+            return torch.ones_like(step.loss_K), step
+        first_K = _differentiate(self.first, step, self.scale)[1] / self.scale
+        return first_K, replace(step, loss_K=first_K * step.loss_K)
+
+    def _weights(self, G_KK: Tensor, first_K: Tensor, step: Step) -> Tensor:
+        """The method's weights [K]; ones where fp16 has overflowed, which no state may learn."""
+        if not torch.isfinite(G_KK).all():
+            return torch.ones_like(step.loss_K)
+        scale_K = first_K.double().cpu()
+        exact = replace(step, loss_K=step.loss_K.double().cpu())
+        return self.method.weights(G_KK * scale_K * scale_K[:, None], exact).to(step.loss_K)
+
+    def _direction(
+        self,
+        J_KP: Tensor,
+        first_K: Tensor,
+        step: Step,
+        batches: Sequence[Sequence[Forward]],
+        lr: float,
+    ) -> tuple[Tensor, Tensor]:
+        """The method's direction [P] and weights [K]; the sum where fp16 has overflowed."""
+        if not torch.isfinite(J_KP.sum()):
+            return J_KP.sum(0), torch.ones_like(step.loss_K)
+        if not isinstance(self.method, LookAheadMethod):
+            return self.method.direction(J_KP, step)
+        first_T = first_K.new_ones(len(self.terms))
+        first_T[step.present] = first_K
+
+        def ahead(direction_P: Tensor) -> Tensor:
+            """The second batch's gradients where a direction leads; the way back is taken, too."""
+            before = [parameter.detach().clone() for parameter in self.shared]
+            with torch.no_grad():
+                for parameter, move in zip(
+                    self.shared, unflatten(direction_P, self.shared), strict=True
+                ):
+                    parameter.sub_(lr * move)
+            with frozen_statistics(self.model):
+                seen = self._differentiated(batches[1], 1.0, [])
+            with torch.no_grad():
+                for parameter, value in zip(self.shared, before, strict=True):
+                    parameter.copy_(value)
+            assert isinstance(seen.gradients, Matrix)
+            ahead_KP = seen.gradients.J_KP * first_T[seen.step.present][:, None]
+            return ahead_KP.nan_to_num(0.0, 0.0, 0.0)  # an overflow there says nothing
+
+        return self.method.direction_ahead(J_KP, step, ahead, lr)
+
+    def _head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
+        if not self.method.weighted_heads:
+            return torch.ones_like(weight_K)
+        return self.method.head_weights(weight_K, step)
+
+    def _differentiated(
+        self, parts: Sequence[Forward], scale: float, own: Sequence[nn.Parameter]
+    ) -> _Seen:
+        """Each loss's gradient, averaged over the parts of the batch that have the loss.
+
+        Args:
+            scale: of the losses before they are differentiated; the method's gradients are free of
+                it, those of `own` are not.
+            own: parameters that are not shared, whose gradients are wanted.
+        """
+        gradients = KINDS[self.method.needs](self.shared, self.terms)
+        own_of: dict[str, list[Tensor | None]] = {}
+        count: Counter[str] = Counter()
+        looked_at = []
+        for part in parts:
+            passed = part()
+            looked_at.append({name: loss.detach() for name, loss in passed.losses.items()})
+            mine, z = gather(passed.losses, self.method.terms), list(passed.representation)
+            del passed  # which holds the losses, too
+            count.update(mine.keys())
+            gradients.add(z, _through_decoders(mine, z, own, own_of, scale))
+        losses = mean_losses(looked_at)
+        step = step_of(self.method, losses)
+        names = _names_of(self.method, step)
+        rows = gradients.mean({name: scale * count[name] for name in names})
+        means = {name: divided(own_of[name], count[name]) for name in names}
+        return _Seen(losses, step, names, rows, gradients, means)
+
+    def _weighted_pass(
+        self, parts: Sequence[Forward], names: Sequence[str], weight_K: Tensor, head_K: Tensor
+    ) -> dict[str, Tensor]:
+        """`.grad` of a batch whose losses count `weight` in what is shared, and `head` in the rest.
+
+        Losses without a name here are left out.
+        """
+        losses, count, passes = _looked_at(self.method, parts, self.model)
+        factors = [self.scale / max(count[name], 1) for name in names]
+        factor_K = torch.tensor(factors).to(weight_K)
+        own_of: dict[str, list[Tensor | None]] = {}
+        total: list[Tensor | None] = [None] * len(self.shared)
+        for passed in passes:
+            mine, z = gather(passed.losses, self.method.terms), list(passed.representation)
+            mine = {name: loss for name, loss in mine.items() if name in names}
+            del passed
+            z_grads = _through_decoders(mine, z, self.own, own_of, 1.0)
+            here = [names.index(name) for name in z_grads]
+            weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))
+            total = add(total, onward(z, weighted, self.shared, keep=False))
+        for parameter, grad in zip(self.shared, total, strict=True):
+            parameter.grad = grad
+        self._add_own(own_of, names, head_K * factor_K)
+        return losses
+
+    def _add_own(
+        self,
+        grads_of: Mapping[str, Sequence[Tensor | None]],
+        names: Sequence[str],
+        weight_K: Tensor,
+    ) -> None:
+        """Weighted gradients of what belongs to one task, into `.grad`."""
+        for name, weight in zip(names, weight_K, strict=True):
+            unit = weight == 1  # most often
+            for parameter, grad in zip(self.own, grads_of.get(name, ()), strict=False):
+                if grad is not None:
+                    grad = grad if unit else grad * weight.to(grad)
+                    parameter.grad = grad if parameter.grad is None else parameter.grad + grad
 
 
 def _through_decoders(
