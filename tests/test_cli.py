@@ -95,7 +95,7 @@ def test_new_in_a_folder_and_check_by_file(tmp_path):
     path = tmp_path / "place" / "mine.py"
     assert "mine" not in call("list", "methods")
     assert "Mine: one line" in call("list", "methods", "--plugins", "place")
-    path.write_text(path.read_text().replace("fixed_K * loss_K", "loss_K * float('nan')"))
+    path.write_text(path.read_text().replace("fixed_K * step.loss_K", "step.loss_K * float('nan')"))
     assert "FAILED" in call("check", path, code=1)
     assert "is no name" in one_line("new", "method", "Not-A-Name")
 

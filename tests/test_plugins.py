@@ -21,8 +21,8 @@ class Mine(LossMethod):
         super().__init__(terms, seed)
         self.factor = factor
 
-    def total(self, loss_T):
-        return self.factor * loss_T.sum()
+    def total(self, step):
+        return self.factor * step.loss_K.sum()
 '''
 
 
@@ -233,7 +233,7 @@ def test_children_find_added_folders_and_describing_imports_nothing(tmp_path):
     put(tmp_path / "extra" / "methods" / "mine.py")
     plugins.add_folder("extra")
     code = (
-        "import sys; from mtl_bench import plugins\n"
+        "import sys; from mtl_bench.core import plugins\n"
         "names = [d.name for kind in plugins.KINDS for d in plugins.describe(kind)]\n"
         "assert 'mine' in names and not {'torch', 'timm'} & set(sys.modules)"
     )

@@ -15,12 +15,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
-from mtl_bench.core.method import LossMethod
 
 
-# For a method that needs the gradient of every loss, derive from GradientMethod (of the same
-# module) and write weights(G_KK, loss_K) or direction(J_KP, loss_K) in place of total.
+# A method that needs the gradient of every loss derives from GradientMethod (of the same module)
+# and writes weights(G_KK, step) in place of total. With needs = "representation" the gradients are
+# those of what the decoders read; with needs = "jacobian" it writes direction(J_KP, step).
 class {title}(LossMethod):
     """sum_i exp(-s_i) w_i L_i + s_i / 2, with w the fixed weights and s learned
 
@@ -33,11 +34,11 @@ class {title}(LossMethod):
         # State that training changes is a parameter (learned) or a buffer: both are checkpointed.
         self.s_T = nn.Parameter(torch.full((len(terms),), init))
 
-    def total(self, loss_K: Tensor) -> Tensor:
+    def total(self, step: Step) -> Tensor:
         """Unweighted losses, in the order of self.terms -> the scalar to minimise."""
-        here = self.present  # which K of the T losses: a batch may lack a task's labels
+        here = step.present  # which K of the T losses: a batch may lack a task's labels
         s_K, fixed_K = self.s_T[here], self.fixed_T[here]
-        return (torch.exp(-s_K) * fixed_K * loss_K + 0.5 * s_K).sum()
+        return (torch.exp(-s_K) * fixed_K * step.loss_K + 0.5 * s_K).sum()
 '''
 
 BACKBONE = '''"""{title}: one line that `mtl-bench list` shows; parameters, licence of the weights.

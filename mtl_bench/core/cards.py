@@ -34,7 +34,7 @@ class Card:
     venue: str = ""  # of its source; empty where the file names none
     year: str = ""
     url: str = ""
-    needs: str = ""  # losses | gradients | representation; empty in a broken file
+    needs: str = ""  # losses | gramian | representation | jacobian; empty in a broken file
     extras: tuple[str, ...] = ()  # what it asks for beyond that
     cost: str = ""  # of a step, in the letters of LEGEND
     settings: Mapping[str, str] = field(default_factory=dict)  # name -> default, as Python text
@@ -57,7 +57,7 @@ def _card(about: Description) -> Card:
         venue=published[1] if published else "",
         year=published[2] if published else "",
         url=_url(source),
-        needs=_needs(line),
+        needs=str(_declared(line).get("needs", "")),
         extras=tuple(_extras(line)),
         cost=_cost(line),
         settings=_settings(line),
@@ -143,12 +143,6 @@ def _is_a(line: Sequence[ast.ClassDef], base: str) -> bool:
     return base in [node.name for node in line]
 
 
-def _needs(line: Sequence[ast.ClassDef]) -> str:
-    if _is_a(line, "LossMethod"):
-        return "losses"
-    return "representation" if _declared(line).get("space") == "representation" else "gradients"
-
-
 def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
     values = _declared(line)
     if values["reevaluates"]:
@@ -157,21 +151,20 @@ def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
         yield "the gradients of a second batch ahead"
     elif values["batches"] != 1:
         yield f"{values['batches']} batches"
-    own_heads = values.get("weighted_heads") or len(_definitions(line, "head_weights")) > 1
-    if own_heads or _is_a(line, "Composed"):
+    if values.get("weighted_heads") or _is_a(line, "Composed"):
         yield "weighted decoders"
 
 
 def _cost(line: Sequence[ast.ClassDef]) -> str:
     """As `backward` spends it; what the method itself computes is not in it."""
-    values, needs = _declared(line), _needs(line)
-    if needs == "losses":
+    values = _declared(line)
+    if values.get("needs") == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
     if _is_a(line, "CrossMethod"):  # decoders' own parameters only of the third
         return "3F + 2K(H + T) + KH + 1T"
     batches = values["batches"]
     each = "" if batches == 1 else batches
-    if needs == "representation":
+    if values.get("needs") == "representation":
         return f"{batches}F + {each}KH + {batches}T"
     return f"{batches}F + {each}K(H + T)"
 

@@ -20,9 +20,8 @@ from mtl_bench.data.loader import train_batches
 from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model, build_model
 from mtl_bench.train import checkpoint
-from mtl_bench.train.backward import Pass, Weighting, backward, losses_now
+from mtl_bench.train.backward import Pass, Weighting, backward, reevaluate
 from mtl_bench.train.curve import Curve
-from mtl_bench.train.gradients import stack_losses
 from mtl_bench.train.progress import Interrupted, Progress
 from mtl_bench.train.tracking import Tracker
 
@@ -108,8 +107,7 @@ def train(
             update_norm = norm_of(model.shared_parameters()) / engine.scaler.get_scale()
             grad_norm = engine.apply_gradients(optimizer, clipped, optim.clip)
             if method.reevaluates:
-                after_K = stack_losses(method, losses_now(parts[0], model))
-                method.after_step(weighting.loss_K, after_K)
+                reevaluate(method, weighting.step, parts[0], model)
             step += 1
 
             row = describe_step(weighting, method, model.tasks, bool(optim.cosine_every))
