@@ -24,6 +24,8 @@ class What(StrEnum):
 class Kind(StrEnum):
     method = "method"
     backbone = "backbone"
+    task = "task"
+    dataset = "dataset"
     engine = "engine"
 
 
