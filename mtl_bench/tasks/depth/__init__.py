@@ -309,7 +309,8 @@ class MeanDepth(Trivial):
             self.depth_count == 0, return_distances=False, return_indices=True
         )
         mean_HW = self.depth_sum / np.maximum(self.depth_count, 1)
-        return mean_HW[tuple(nearest)].astype(np.float32)
+        found: NDArray[np.float32] = mean_HW[tuple(nearest)].astype(np.float32)
+        return found
 
     def result(self, count: int, size: Size) -> Results:
         depth_m_HW = torch.from_numpy(pixels.sampled(self.depth_m_HW(), size))

@@ -269,7 +269,8 @@ class MostFrequentClass(Trivial):
         """IGNORE where no class was ever seen; ties go to the lowest."""
         most_HW = self.votes.argmax(0).astype(np.uint8)
         most_HW[self.votes.max(0) == 0] = IGNORE
-        return most_HW
+        found: NDArray[np.uint8] = most_HW
+        return found
 
     def result(self, count: int, size: Size) -> Results:
         class_BHW = torch.from_numpy(sampled(self.class_HW(), size)).expand(count, -1, -1)
