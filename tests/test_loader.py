@@ -62,7 +62,7 @@ def test_a_batch_splits_into_consecutive_parts(tree):
             values = [getattr(part, field.name) for part in parts]
             if isinstance(values[0], torch.Tensor):
                 assert torch.equal(torch.cat(values), getattr(batch, field.name)), field.name
-    assert batch.split(2)["depth_m" not in 1].fields
+    assert "depth_m" not in batch.split(2)[1].fields
     for size in (4, 0, 7, -2):
         with pytest.raises(ValueError, match=rf"micro_batch = {size} does not divide a batch of 6"):
             batch.split(size)
