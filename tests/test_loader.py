@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from cityscapes_tree import HEIGHT, WIDTH, file, open_tree, write_tree
+from cityscapes_tree import HEIGHT, WIDTH, assert_same, file, open_tree, write_tree
 
 from mtl_bench.core import config
 from mtl_bench.core.task import tasks_of_cell
@@ -24,15 +24,6 @@ def tree(tmp_path_factory):
 
 def take(dataset, count, **settings):
     return list(islice(train_batches(dataset, **{"batch_size": 3, "seed": 5, **settings}), count))
-
-
-def assert_same(one, two):
-    assert one.names == two.names
-    a, b = one.tensors(), two.tensors()
-    assert a.keys() == b.keys()
-    for name in a:
-        assert a[name].dtype == b[name].dtype
-        assert torch.equal(a[name], b[name]), name
 
 
 def test_batches_are_stacked(tree):

@@ -21,7 +21,7 @@ from mtl_bench.core.config import Augment, Cell, Data, Evaluate, Loss, Network, 
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.labels import IGNORE, class_of_instance_id
 from mtl_bench.core.plain import to_dict
-from mtl_bench.core.task import tasks_of_cell
+from mtl_bench.core.task import tasks_of, tasks_of_cell
 from mtl_bench.data import pseudo_frames
 from mtl_bench.data import scenes as synthetic
 from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, file_of, names_in, read_instance_ids
@@ -30,7 +30,7 @@ from mtl_bench.data.samples import open_samples
 from mtl_bench.data.scenes import render
 from mtl_bench.evaluate.walk import evaluating
 from mtl_bench.model import Outputs, build_model
-from mtl_bench.tasks.panoptic import Panoptic, pseudo_labels
+from mtl_bench.tasks.panoptic import pseudo_labels
 from mtl_bench.tasks.panoptic.pseudo_labels import RECORD, average, pass_sizes
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 from mtl_bench.train import checkpoint
@@ -60,11 +60,15 @@ def with_pseudo(**changes):
     return with_recipe(pseudo=replace(CELL.recipe.pseudo, **changes))
 
 
+def panoptic_of(cell):
+    return tasks_of(cell.recipe, ("panoptic",), CITYSCAPES20)[0]
+
+
 def ensure(model, cell, root, out, progress=None):
     """Label the training split's frames."""
     frames = dataset_of(cell.recipe).frames_to_label(root, out, "train", cell.recipe)
     with evaluating(model):
-        return Panoptic(cell.recipe, CITYSCAPES20).label(model, frames, CPU, progress)
+        return panoptic_of(cell).label(model, frames, CPU, progress)
 
 
 class Net(nn.Module):
@@ -434,7 +438,7 @@ def test_what_cannot_be_labelled(scenes, knowing, tmp_path):
 # --- scales and mirror images ---------------------------------------------------------------------
 
 
-TASK = Panoptic(CELL.recipe, CITYSCAPES20)
+TASK = panoptic_of(CELL)
 
 
 def ramps(image_B3HW):
