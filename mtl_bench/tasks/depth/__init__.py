@@ -256,8 +256,13 @@ class DepthMetric(Metric):
 
     def state(self) -> dict[str, NDArray[Any]]:
         found = {f"errors.{key}": errors.state() for key, errors in self.errors.items()}
-        ratios = np.array(self.scale_ratios)
-        return {**found, "sources": self.sources, "ratios": ratios, "frames": np.array(self.frames)}
+        return {
+            **found,
+            "sources": self.sources,
+            "ratios": np.array(self.scale_ratios),
+            "frames": np.array(self.frames),
+            "sizes": np.array(list(self.sizes), np.int64).reshape(-1, 2),
+        }
 
     def add(self, state: Mapping[str, NDArray[Any]]) -> None:
         for key, errors in self.errors.items():
@@ -265,6 +270,7 @@ class DepthMetric(Metric):
         self.sources += state["sources"]
         self.scale_ratios += state["ratios"].tolist()
         self.frames += int(state["frames"])
+        self.sizes |= dict.fromkeys((height, width) for height, width in state["sizes"].tolist())
 
     def compute(self) -> dict[str, float]:
         metrics: dict[str, float] = {}
