@@ -34,11 +34,11 @@ EXCLUDED = {
         "core.fingerprint",
         "core.columns",
         "core.files",
-        "core.quiet",
+        "core.locks",
         "train.progress",
         "train.tracking",
     ),
-    *("train.curve", "bench.claim", "bench.results", "cli", "report", "show"),
+    *("train.curve", "bench.jobs", "bench.store", "cli", "report", "show"),
 }
 MEMBERS = "stage_members"
 SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
