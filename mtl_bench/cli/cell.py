@@ -94,6 +94,8 @@ def train(
     else:
         if backbone is None or method is None:
             raise ValueError("say which cell: --backbone NAME and --method NAME, or a cell.json")
+        if tasks is not None and not o.names(tasks):
+            raise ValueError("a cell needs a task: --tasks NAME,NAME")
         weights = o.weights(pretrained)
         cell = Cell(
             load_recipe(recipe),

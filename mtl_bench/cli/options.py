@@ -158,7 +158,12 @@ def bar(title: str, quiet: bool, *more: str) -> "Progress":
         TimeRemainingColumn,
     )
 
-    columns: tuple[str | ProgressColumn, ...] = (title, BarColumn(), MofNCompleteColumn(), *map(TextColumn, more))
+    columns: tuple[str | ProgressColumn, ...] = (
+        title,
+        BarColumn(),
+        MofNCompleteColumn(),
+        *map(TextColumn, more),
+    )
     return Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet)
 
 
