@@ -306,13 +306,17 @@ def test_ego_mask_is_for_frames_without_labels(tree):
     labelled = np.isin(instance_ids(), [1, 23])
     dataset = open_tree(tree, augment=PLAIN)
     assert (dataset.reprojection_mask, dataset.needs_automask) == ("labels", False)
-    assert np.array_equal(dataset.sample(0, generator()).fields["reprojection_mask"].numpy(), ~labelled)
+    assert np.array_equal(
+        dataset.sample(0, generator()).fields["reprojection_mask"].numpy(), ~labelled
+    )
 
     file(tree, "gtFine", NAME, "gtFine_instanceIds.png").unlink()
     dataset = open_tree(tree, augment=PLAIN, panoptic=False)
     assert dataset.reprojection_mask == "labels, or ego_mask.png where a frame lacks them"
     assert dataset.needs_automask
-    masks = [dataset.sample(index, generator()).fields["reprojection_mask"].numpy() for index in (0, 1)]
+    masks = [
+        dataset.sample(index, generator()).fields["reprojection_mask"].numpy() for index in (0, 1)
+    ]
     assert np.array_equal(masks[0], ~ego)
     assert np.array_equal(masks[1], ~labelled)
 

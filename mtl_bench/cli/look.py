@@ -16,6 +16,8 @@ class What(StrEnum):
     all = "all"
     methods = "methods"
     backbones = "backbones"
+    tasks = "tasks"
+    datasets = "datasets"
     engines = "engines"
     recipes = "recipes"
     grids = "grids"
@@ -45,7 +47,7 @@ def show(
     ] = False,
     plugins: o.PluginsOption = None,
 ) -> None:
-    """List methods, backbones, engines, recipes and grids, without importing any."""
+    """List methods, backbones, tasks, data sets, engines, recipes and grids; imports none."""
     if markdown:
         typer.echo(_page(what), nl=False)
         return
@@ -144,8 +146,8 @@ def check(
         kinds = kinds_of(name)
         if not kinds and word.endswith(".py"):
             raise ValueError(
-                f"{word} is neither: a method imports mtl_bench.core.method, a backbone "
-                "mtl_bench.model, an engine mtl_bench.core.engine"
+                f"{word} is none: a plug-in imports mtl_bench.core.method, backbone, task, dataset "
+                "or engine"
             )
         if not kinds:
             known = [known for kind in KINDS for known in files(kind)]

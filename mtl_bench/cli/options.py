@@ -42,8 +42,8 @@ PluginsOption = Annotated[
     typer.Option(
         "--plugins",
         metavar="DIR",
-        help="More methods and backbones: a folder with methods/ and backbones/ or with the files "
-        "themselves, or one file. Repeatable.",
+        help="More plug-ins: a folder with methods/, backbones/, tasks/, datasets/ or engines/ in it "
+        "or with the files themselves, or one file. Repeatable.",
         callback=_add_plugins,
         is_eager=True,
         show_default=False,
@@ -158,13 +158,9 @@ def bar(title: str, quiet: bool, *more: str) -> "Progress":
         TimeRemainingColumn,
     )
 
-    columns: tuple[str | ProgressColumn, ...] = (
-        title,
-        BarColumn(),
-        MofNCompleteColumn(),
-        *map(TextColumn, more),
-    )
-    return Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet)
+    middle: list[ProgressColumn] = [BarColumn(), MofNCompleteColumn(), *map(TextColumn, more)]
+    columns = (title, *middle, TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True), disable=quiet)
 
 
 def echo(quiet: bool) -> Callable[[str], None]:

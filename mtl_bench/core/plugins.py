@@ -247,13 +247,40 @@ def _assigned(text: bytes) -> Iterator[tuple[str, ast.expr]]:
             yield from ((ast.unparse(target), item.value) for target in targets if target)
 
 
+def bases(kind: str, text: bytes) -> list[str]:
+    """Names of the shipped plug-ins that a file's classes derive from."""
+    package = ".".join(("mtl_bench", *SHIPPED[kind].relative_to(PACKAGE).parts))
+    tree = _parse(text)
+    derived = {
+        ast.unparse(base)
+        for node in tree.body
+        if isinstance(node, ast.ClassDef)
+        for base in node.bases
+    }
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
+    return [
+        str(node.module).removeprefix(f"{package}.")
+        for node in imports
+        if str(node.module).rpartition(".")[0] == package
+        and any((alias.asname or alias.name) in derived for alias in node.names)
+    ]
+
+
+def family(task: str) -> set[str]:
+    """A task and those that it derives from."""
+    found = {task}
+    for base in bases("tasks", path_of("tasks", task).read_bytes()):
+        found |= family(base)
+    return found
+
+
 def ordered(tasks: Iterable[str]) -> list[str]:
     """Names of tasks, each behind those whose results it reads, else by the alphabet.
 
     Raises:
         ValueError: an unknown task, or tasks that wait for each other.
     """
-    after = {name: set(attributes("tasks", name).get("after", ())) for name in sorted(tasks)}
+    after = {name: _after(name) for name in sorted(tasks)}
     found: list[str] = []
     while len(found) < len(after):
         ready = [n for n in after if n not in found and after[n] & after.keys() <= set(found)]
@@ -261,6 +288,12 @@ def ordered(tasks: Iterable[str]) -> list[str]:
             raise ValueError(f"tasks wait for each other: {', '.join(after.keys() - set(found))}")
         found.append(ready[0])
     return found
+
+
+def _after(task: str) -> set[str]:
+    """Tasks whose results a task reads; an heir's are those of the task that it derives from."""
+    found = [attributes("tasks", name).get("after") for name in family(task)]
+    return set().union(*filter(None, found))
 
 
 def lack(packages: Iterable[str], extra: Iterable[str]) -> str | None:

@@ -18,20 +18,27 @@ ALLOWED = (
 
 def quality() -> tuple[Column, ...]:
     """Of every task that is found, each behind those whose results it reads."""
-    return tuple(
-        column
-        for name in plugins.ordered(plugins.files("tasks"))
-        for column in _columns(name, plugins.path_of("tasks", name).read_bytes())
-    )
+    found: dict[str, Column] = {}
+    for name in plugins.ordered(plugins.files("tasks")):
+        for column in columns_of(name):
+            found.setdefault(column.name, column)  # a task's heir has its columns, too
+    return tuple(found.values())
 
 
-@functools.cache
-def _columns(task: str, text: bytes) -> tuple[Column, ...]:
-    """What a file's `columns = (Column(...), ...)` says.
+def columns_of(task: str) -> tuple[Column, ...]:
+    """A task's columns; an heir's come after those of the task that it derives from.
 
     Raises:
         ValueError: anything but columns of plain values.
     """
+    text = plugins.path_of("tasks", task).read_bytes()
+    inherited = [column for base in plugins.bases("tasks", text) for column in columns_of(base)]
+    return (*inherited, *_columns(task, text))
+
+
+@functools.cache
+def _columns(task: str, text: bytes) -> tuple[Column, ...]:
+    """What a file's `columns = (Column(...), ...)` says."""
     for node in plugins.class_attributes(text, "columns"):
         for part in ast.walk(node):
             known = isinstance(part, ALLOWED)

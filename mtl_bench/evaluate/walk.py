@@ -171,7 +171,7 @@ def measure(
                 picture: Picture = {"names": name}
                 for task, metric in walk.measured:
                     seen = metric.update(
-                        frame_truth(task, batch, slot), _frame(found[task.name], slot)
+                        frame_truth(task, batch, slot), frame_of(found[task.name], slot)
                     )
                     picture = {**seen, **picture}
                 if main:
@@ -194,7 +194,8 @@ def frame_truth(task: Task, batch: Batch, slot: int) -> dict[str, NDArray[Any]]:
     }
 
 
-def _frame(results: Results, slot: int) -> dict[str, NDArray[Any]]:
+def frame_of(results: Results, slot: int) -> dict[str, NDArray[Any]]:
+    """One frame's results."""
     return {name: value[slot].cpu().numpy() for name, value in results.items()}
 
 

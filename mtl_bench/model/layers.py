@@ -12,6 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mtl_bench.core.recipe import Network
+from mtl_bench.core.task import Maps, TaskHead
+
 LEAK = 0.01  # LeakyReLU slope of the paper's InPlaceABN
 
 
@@ -100,6 +103,28 @@ class Head(nn.Sequential):
 
     def __init__(self, inputs: int, hidden: int, outputs: int):
         super().__init__(ConvNorm(inputs, hidden, 3), nn.Conv2d(hidden, outputs, 1, bias=False))
+
+
+class DenseHead(TaskHead):
+    """One decoder and one head: a raw map of some channels at the finest stride.
+
+    Args:
+        name: of the task; its map has it, too.
+        inputs: channels of the features, finest first.
+        outputs: channels of the map.
+    """
+
+    def __init__(self, name: str, inputs: tuple[int, ...], sizes: Network, outputs: int):
+        super().__init__()
+        self.name = name
+        self.decoders = nn.ModuleDict({name: Decoder(inputs, sizes.channels, sizes.fused)})
+        self.heads = nn.ModuleDict({name: Head(sizes.fused, sizes.head, outputs)})
+
+    def forward(
+        self, pyramid: Sequence[Tensor], context_BC11: Tensor, auxiliary: bool = False
+    ) -> Maps:
+        features_BChw = self.decoders[self.name](pyramid, context_BC11)[0]
+        return {self.name: self.heads[self.name](features_BChw)}
 
 
 def init_fan_in(module: nn.Module) -> None:

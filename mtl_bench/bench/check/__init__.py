@@ -9,13 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from mtl_bench.bench.check.backbones import BACKBONE_CHECKS
+from mtl_bench.bench.check.datasets import DATASET_CHECKS
 from mtl_bench.bench.check.engines import ENGINE_CHECKS
 from mtl_bench.bench.check.methods import METHOD_CHECKS
+from mtl_bench.bench.check.tasks import TASK_CHECKS
 from mtl_bench.core import plugins
 
 CHECKS: dict[str, Mapping[str, Callable[..., Any]]] = {
     "methods": METHOD_CHECKS,
     "backbones": BACKBONE_CHECKS,
+    "tasks": TASK_CHECKS,
+    "datasets": DATASET_CHECKS,
     "engines": ENGINE_CHECKS,
 }
 
@@ -31,7 +35,7 @@ def check(kind: str, name: str) -> list[CheckResult]:
     """Run every check of a plug-in; a failed one says what was wrong, none stops the others.
 
     Args:
-        kind: "methods", "backbones" or "engines".
+        kind: one of `plugins.KINDS`.
         name: the file's stem.
     """
     path = plugins.path_of(kind, name)
