@@ -1,8 +1,10 @@
-"""Rows of a grid of latencies as `latency_runs.rows` gives them, made up."""
+"""Rows of a grid of latencies as `store.rows` gives them, made up."""
 
-from mtl_bench.bench.timing import Timing
-from mtl_bench.core.config import TASKS
+from mtl_bench.bench.jobs import Timing
+from mtl_bench.core.config import Recipe
 from mtl_bench.core.plain import to_dict
+
+TASKS = Recipe.tasks
 
 FACTOR = {"plain": 1.0, "eager": 0.8, "onnxruntime": 0.5, "openvino": 0.4}
 BACKBONES = {"resnet18": 1.0, "tiny_one": 0.25}

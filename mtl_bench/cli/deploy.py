@@ -100,15 +100,16 @@ def latency(
     Its output is compared with the plain network's before. Without --data the built-in frames of
     the split val are looked at, resized to --size.
     """
-    from mtl_bench.bench import claim, results
+    from mtl_bench.core import locks
+    from mtl_bench.core.files import write_json
 
-    claim.end_with_launcher()
+    locks.end_with_launcher()
     if ALL in (engine, precision):
         rows = _all(engine, precision, device)
         for line in o.columns(_table(rows)):
             typer.echo(line)
         if file is not None:
-            results.write_json(file, rows)
+            write_json(file, rows)
         _end([row["status"] for row in rows])
         return
     cell, model = _network(checkpoint, backbone, recipe, tasks, settings)
@@ -123,12 +124,12 @@ def latency(
     chosen = choose_device(device.value)
     torch.set_num_threads(threads or provenance.cores())
     what = subject(
-        cell, model, size=_size(size), data=root, device=chosen, trained=checkpoint is not None
+        cell, model, size=o.size(size), data=root, device=chosen, trained=checkpoint is not None
     )
     plan = timer.Plan(passes, seconds, batch, threads or provenance.cores())
     row = timer.row(what, engine, precision, chosen, plan)
     if file is not None:
-        results.write_json(file, row)
+        write_json(file, row)
     for line in _lines(row, f"limits {timer.SPREAD}, {timer.DRIFT}"):
         typer.echo(line)
     _end([row["status"]])
@@ -159,9 +160,9 @@ def export(
     from mtl_bench.deploy import export as exporter
     from mtl_bench.deploy.subject import check_size
 
-    check_size(cell, _size(size))
+    check_size(cell, o.size(size))
     origin = {} if checkpoint is None else {"cell_id": cell.id, "cell": cell.slug}
-    paths = exporter.export(model.net.eval(), _size(size), out, post, origin)
+    paths = exporter.export(model.net.eval(), o.size(size), out, post, origin)
     import onnx
 
     for path in paths:
@@ -199,13 +200,6 @@ def _network(
     from mtl_bench.deploy.subject import untrained
 
     return untrained(backbone, recipe, names, settings or [])
-
-
-def _size(text: str) -> tuple[int, int]:
-    height, _, width = text.partition("x")
-    if not (height.isdecimal() and width.isdecimal()):
-        raise ValueError(f"--size '{text}' is not HxW, such as 1024x2048")
-    return int(height), int(width)
 
 
 def _all(engine: str, precision: str, device: o.Device) -> list[dict[str, Any]]:

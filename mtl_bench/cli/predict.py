@@ -117,7 +117,7 @@ def predict(
     given = Given(camera, calib, _focal_and_center(fx, fy, cx, cy), camera_height)
     paths = predictions.find(inputs)
     video = predictions.is_video(paths)
-    predictor = _predictor(checkpoint, _size(size), device)
+    predictor = _predictor(checkpoint, None if size is None else o.size(size), device)
     job = predictions.Job(predictor, given, _kinds(what, video, predictor.cell.tasks))
     run = predictions.predict_video if video else predictions.predict_images
     with (
@@ -136,15 +136,12 @@ def predict(
 
 def _predictor(checkpoint: Path, size: tuple[int, int] | None, device: o.Device) -> "Predictor":
     """The checkpoint's model, ready to be asked."""
-    from mtl_bench.bench import results
+    from mtl_bench.bench.jobs import load_run
     from mtl_bench.bench.stored import load_model
     from mtl_bench.core.device import Engine, choose_device
     from mtl_bench.show.predict import Predictor
 
-    if not checkpoint.exists():
-        raise ValueError(f"no run or checkpoint '{checkpoint}'")
-    weights = checkpoint / "last.pt" if checkpoint.is_dir() else checkpoint
-    cell = results.load_cell(weights.parent / "cell.json")
+    cell, weights = load_run(checkpoint)
     engine = Engine(choose_device(device.value), cell.recipe.optim.precision)
     return Predictor(load_model(cell, weights, engine), cell, engine.device, size)
 
@@ -168,16 +165,6 @@ def _kinds(what: str | None, video: bool, tasks: tuple[str, ...]) -> list[str]:
     return kinds
 
 
-def _size(text: str | None) -> tuple[int, int] | None:
-    """Raises: ValueError: not HxW."""
-    if text is None:
-        return None
-    height, _, width = text.lower().partition("x")
-    if not (height.isdecimal() and width.isdecimal()):
-        raise ValueError(f"--size '{text}' is not HxW, such as 256x512")
-    return int(height), int(width)
-
-
 def _focal_and_center(
     fx: float | None, fy: float | None, cx: float | None, cy: float | None
 ) -> tuple[float, float, float, float] | None:
@@ -192,18 +179,7 @@ def _focal_and_center(
 @contextmanager
 def _progress(job: "Job", quiet: bool) -> Iterator[None]:
     """A bar on stderr with frames a second, while the job runs."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    speed = TextColumn("{task.fields[fps]:.1f} FPS")
-    columns = ("predicting", BarColumn(), MofNCompleteColumn(), speed, TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
+    with o.bar("predicting", quiet, "{task.fields[fps]:.1f} FPS") as bar:
         task = bar.add_task("", total=None, fps=0.0)
 
         def show(done: int, total: int) -> None:

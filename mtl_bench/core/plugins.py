@@ -28,6 +28,8 @@ from pathlib import Path
 from typing import Any
 
 from mtl_bench.core.config import Cell, did_you_mean
+from mtl_bench.core.fingerprint import ancestry, of_package
+from mtl_bench.core.fingerprint import load as load_text
 
 PACKAGE = Path(__file__).resolve().parents[1]
 VARIABLE = "MTL_BENCH_PLUGINS"  # what --plugins adds to; the processes that run cells inherit it
@@ -138,7 +140,7 @@ def _kind_of(path: Path) -> str | None:
     folder = path.parent.parent if path.stem == "__init__" else path.parent
     for kind, place in SHIPPED.items():
         if folder == place:  # other modules lie beside the plug-ins
-            return kind if path in _derived(folder, BASES[kind][1]) else None
+            return kind if _derives(path, kind) else None
     if folder.name in KINDS:
         return folder.name
     text = path.read_text(encoding="utf-8", errors="replace")
@@ -153,23 +155,11 @@ def _kind_of(path: Path) -> str | None:
 
 
 @functools.cache
-def _derived(folder: Path, base: str) -> set[Path]:
-    """Files of a shipped folder that define a class whose bases lead, through the folder, to one
-    of this name or whose name ends with it."""
-    classes = [
-        (node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases}, path)
-        for path in _files_in(folder)
-        for node in _parse(path.read_bytes()).body
-        if isinstance(node, ast.ClassDef)
-    ]
-    names, found, size = {base, f"Graph{base}"}, set[Path](), -1
-    while len(found) > size:  # a class may come before its base
-        size = len(found)
-        for name, bases, path in classes:
-            if bases & names:
-                names.add(name)
-                found.add(path)
-    return found
+def _derives(path: Path, kind: str) -> bool:
+    """Whether a file of this package defines a class that descends from a kind's contract."""
+    module, base = BASES[kind]
+    contract = of_package(module.removeprefix("mtl_bench.")), base
+    return any(contract in ancestry(path, name) for name in load_text(path).statements)
 
 
 @functools.cache

@@ -50,8 +50,8 @@ def code(cell: Cell) -> Code:
     }
     if cell.video:
         labels = fingerprints("label", [*tasks, dataset])
-        named = {f"labels by {part}": code for part, code in labels.items()}
-        found["train"] = found["train"] | named
+        made = {f"labels by {part}": code for part, code in labels.items()}
+        found["train"] = found["train"] | made
     return found
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtl_bench.bench import results
+from mtl_bench.bench.jobs import load_cell
 from mtl_bench.bench.stored import load_model
 from mtl_bench.core.config import Cell, did_you_mean
 from mtl_bench.core.device import Engine, choose_device
@@ -39,7 +39,7 @@ def load(run: Path, device: str = "auto") -> Predictor:
     if not run.exists():
         raise ValueError(f"no run or checkpoint '{run}'")
     weights = run / CHECKPOINT if run.is_dir() else run
-    cell = results.load_cell(weights.parent / "cell.json")
+    cell = load_cell(weights.parent / "cell.json")
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
     return Predictor(load_model(cell, weights, engine), cell, engine.device)
 

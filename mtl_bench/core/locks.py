@@ -1,4 +1,9 @@
-"""One process at a time runs a cell: a file that says who, void once that process is dead."""
+"""Who works where: a claim on a folder, and quiet for the process that is being timed.
+
+A claim is a file that says who runs a job, void once that process is dead. Quiet is a lock file in
+runs/: whoever is timed holds it, every neighbour passes by it between two steps. The system
+releases the lock of a process that dies.
+"""
 
 import contextlib
 import hashlib
@@ -14,16 +19,20 @@ from typing import Any
 
 TOUCH_S = 30.0  # how often a running process renews its claim
 EXPIRES_S = 600.0  # age at which a claim is void
+CLAIMED = 75  # exit code of a command that found its job claimed
 LAUNCHER = "MTL_BENCH_LAUNCHER"  # process id of the launcher that started this process
 POLL_S = 1.0
+TIMING = ".timing"  # the lock file of what is timed
+SIDE_BY_SIDE = "MTL_BENCH_SIDE_BY_SIDE"  # set for cells that a launcher runs at the same time
+STEP_S = 1.0  # for a neighbour to finish the step that it is in
 
 
 class ClaimedError(Exception):
-    """Another process is running the cell."""
+    """Another process is running the job."""
 
 
 def claimed_by(directory: Path) -> dict[str, Any] | None:
-    """Who is running a cell now: {"pid": ..., "machine": ...}; None where nobody is.
+    """Who is running a job now: {"pid": ..., "machine": ...}; None where nobody is.
 
     A claim is void ten minutes after it was last renewed; on this machine, also as soon as its
     process is dead.
@@ -44,7 +53,7 @@ def claimed_by(directory: Path) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def claim(directory: Path) -> Iterator[None]:
-    """Hold a cell's run directory, which is made where it is missing, while the block runs.
+    """Hold a run directory, which is made where it is missing, while the block runs.
 
     Started by a launcher, the process also watches it: a launcher that was killed outright takes
     its cells with it, as an interruption, instead of leaving them to run unseen.
@@ -150,3 +159,27 @@ def _alive(pid: int) -> bool:
 def _machine() -> str:
     """Tells machines apart without naming them."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+
+
+# --- quiet ----------------------------------------------------------------------------------------
+
+
+class Quiet:
+    """The lock of a runs folder, which exists: what runs side by side in it can hold still."""
+
+    def __init__(self, runs: Path):
+        from filelock import FileLock  # takes longer to import than `--help` may take
+
+        self._lock = FileLock(runs / TIMING)
+
+    def pass_by(self) -> None:
+        """Wait while another process is timed."""
+        with self._lock.acquire(poll_interval=0.02):
+            pass
+
+    @contextlib.contextmanager
+    def alone(self, neighbours: bool) -> Iterator[None]:
+        """Hold others back inside; `neighbours`: there may be some, in the middle of a step."""
+        with self._lock.acquire(poll_interval=0.02):
+            time.sleep(STEP_S if neighbours else 0)
+            yield
