@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-
-from mtl_bench.core import config
 from mtl_bench.tasks.depth.errors import (
     NAMES,
     DepthErrors,
@@ -11,6 +9,8 @@ from mtl_bench.tasks.depth.errors import (
     evaluation_mask,
     median_scale,
 )
+
+from mtl_bench.core import config
 
 EV = config.Evaluate()
 TRUE = np.array([[2, 5, 10, 40, 79.9]])

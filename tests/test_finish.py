@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from mtl_bench.tasks.finish import Finish
 
 from mtl_bench.core import config, geometry
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.tasks.finish import Finish
 from mtl_bench.tasks.panoptic import postprocess
 
 THINGS = CITYSCAPES20.things

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mtl_bench.tasks.panoptic.quality import PanopticQuality
 
 from mtl_bench.core import config
 from mtl_bench.core.labels import IGNORE
@@ -15,7 +16,6 @@ from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.model import Outputs
 from mtl_bench.tasks.depth import scale as depth_scale
 from mtl_bench.tasks.panoptic import postprocess
-from mtl_bench.tasks.panoptic.quality import PanopticQuality
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 THINGS = CITYSCAPES20.things
