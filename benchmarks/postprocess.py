@@ -18,12 +18,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from mtl_bench.tasks.finish import Finish
 from torch import Tensor
 
 from mtl_bench.core.config import Evaluate
 from mtl_bench.core.geometry import back_project, depth_from_inverse
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.tasks.finish import Finish
 from mtl_bench.tasks.panoptic import postprocess
 from mtl_bench.tasks.panoptic.grouping import nearest
 

@@ -50,7 +50,12 @@ def text_width(text: str, height: int) -> int:
 
 
 def write(
-    image_HW3: Image, text: str, left: float, base: float, height: int, color: tuple = INK
+    image_HW3: Image,
+    text: str,
+    left: float,
+    base: float,
+    height: int,
+    color: tuple[int, int, int] = INK,
 ) -> None:
     """Draw one line of text into an image; `base` is the row that its letters stand on."""
     place = (round(left), round(base))

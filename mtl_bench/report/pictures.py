@@ -35,7 +35,8 @@ class Picture:
     def draw(self, image: Image, map_HW: NDArray[Any], labels: LabelSet) -> Image:
         """Input and map are of one size; imports the task."""
         view = plugins.load("tasks", self.task).drawn_view(self.key, map_HW, labels)
-        return view.picture(image)
+        drawn: Image = view.picture(image)
+        return drawn
 
 
 def pictures() -> dict[Picture, str]:

@@ -5,6 +5,7 @@ rays a quarter of a pixel from it where these see different solids, and one samp
 box-filtered) texture where they see the same.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,7 +138,7 @@ def _draw_light(rng: np.random.Generator) -> Light:
     horizon = ((0.75, 0.85, 0.97), (0.86, 0.87, 0.88), (0.98, 0.86, 0.72))[weather]
     exposure = rng.uniform(0.78, 1.12)
 
-    def as_color(color: tuple[float, ...], factor: float = 1.0) -> NDArray[np.float32]:
+    def as_color(color: Sequence[float], factor: float = 1.0) -> NDArray[np.float32]:
         return np.array(color, np.float32) * np.float32(factor)
 
     return Light(

@@ -106,7 +106,7 @@ class Predictor:
         return self.size[0], _near(round(self.size[0] * width / height), self.stride)
 
     def _batch(
-        self, image_HW3: Image, K_33: NDArray, camera_height_m: float, pitch_rad: float
+        self, image_HW3: Image, K_33: NDArray[Any], camera_height_m: float, pitch_rad: float
     ) -> Batch:
         height, width = self.size
         rows, columns = image_HW3.shape[:2]

@@ -42,7 +42,7 @@ class Job:
     progress: Progress | None = None
     frames: int = 0
     predict_s: float = 0.0
-    scales: Counter = field(default_factory=Counter)  # "m by road": frames
+    scales: Counter[str] = field(default_factory=Counter)  # "m by road": frames
     began: float = field(default_factory=time.perf_counter)
 
     def predict(self, name: str, image_HW3: Image, camera: Mounted) -> Predicted:
