@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+Color = tuple[int, int, int]  # RGB
 Image = NDArray[np.uint8]
 MIN_WIDTH = 640  # pixels of a picture with text
 WHITE, INK = (255, 255, 255), (30, 30, 30)
