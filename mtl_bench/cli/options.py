@@ -42,8 +42,8 @@ PluginsOption = Annotated[
     typer.Option(
         "--plugins",
         metavar="DIR",
-        help="More plug-ins: a folder with methods/, backbones/, tasks/, datasets/ or engines/ in it "
-        "or with the files themselves, or one file. Repeatable.",
+        help="More plug-ins: a folder with methods/, backbones/, tasks/, datasets/ or engines/ in "
+        "it or with the files themselves, or one file. Repeatable.",
         callback=_add_plugins,
         is_eager=True,
         show_default=False,
