@@ -96,6 +96,7 @@ ICML 2031, arXiv:3101.00001, and not NeurIPS 2032.
 """
 
 from mtl_bench.core import method
+from mtl_bench.core.method import CrossMethod, GradientMethod, LossMethod
 {imports}
 
 class Mine({base}):
@@ -164,7 +165,8 @@ def test_needs_and_cost(tmp_path, base, body, needs, cost, extras):
 
 def test_what_a_helper_beside_it_declares_counts(tmp_path):
     (tmp_path / "methods").mkdir()
-    helper = "class Base(GradientMethod):\n    batches = 2\n    needs = 'representation'\n"
+    helper = "from mtl_bench.core.method import GradientMethod\n"
+    helper += "class Base(GradientMethod):\n    batches = 2\n    needs = 'representation'\n"
     (tmp_path / "methods" / "_base.py").write_text(helper)
     text = mine("Base", imports="from ._base import Base\n")
     card = card_of(tmp_path / "methods" / "mine.py", text)
