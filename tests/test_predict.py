@@ -352,6 +352,9 @@ def test_only_what_is_asked_for_is_written(run, tree):
     out = tree.root / "out"
     assert command(run, tree.plain, "--out", out, "--what", "ids", "-q").output == ""
     assert {path.name for path in out.iterdir()} == {"prediction.json", "plain_instanceIds.png"}
+    assert command(run, tree.plain, "--out", out / "b", "--what", "depth", "-q").output == ""
+    names = {"prediction.json", "plain_depth.png", "plain_depth_colors.png"}
+    assert {path.name for path in (out / "b").iterdir()} == names
 
 
 def test_a_cell_of_one_task_predicts_that(tree, tmp_path):

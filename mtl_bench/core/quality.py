@@ -13,10 +13,8 @@ from typing import Any, TypeVar
 from mtl_bench.core import plugins
 from mtl_bench.core.columns import Column
 
-ALLOWED = (
-    *(ast.Call, ast.Name, ast.Starred, ast.Tuple, ast.keyword, ast.Constant, ast.UnaryOp),
-    *(ast.UAdd, ast.USub, ast.Load, ast.Dict),
-)
+VALUES = ast.Call | ast.Name | ast.Starred | ast.Tuple | ast.Dict | ast.keyword | ast.Constant
+SIGNS = ast.UnaryOp | ast.UAdd | ast.USub | ast.Load
 T = TypeVar("T")
 
 
@@ -39,7 +37,7 @@ def _read(task: str, text: bytes, name: str) -> Any:
     """
     for node in plugins.class_attributes(text, name):
         for part in ast.walk(node):
-            known = isinstance(part, ALLOWED)
+            known = isinstance(part, VALUES | SIGNS)
             if not known or (isinstance(part, ast.Name) and part.id != "Column"):
                 raise ValueError(f"task '{task}': {name} are plain values and Column(...) of them")
         return eval(compile(ast.Expression(node), task, "eval"), {"Column": Column})

@@ -53,7 +53,7 @@ class View:
         raise NotImplementedError
 
     def files(self, kind: str, image_HW3: Image) -> dict[str, NDArray[Any]]:
-        """PNG files of one of the task's kinds: ending -> pixels."""
+        """PNG files of a kind, none where it is another task's: ending -> pixels."""
         raise NotImplementedError
 
     @classmethod

@@ -96,9 +96,9 @@ def predict_images(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, A
         write_files(base, predicted, job.kinds, job.predictor.labels)
         image = {"input": str(path), "name": stem, "size": list(image_HW3.shape[:2])}
         surface = predicted.surface
-        scale = (surface.unit, surface.source) if surface else (None, None)
-        known = dict(zip(("unit", "scale_from"), scale, strict=True))
-        images.append({**image, "camera": _camera(camera), **known})
+        unit, source = (surface.unit, surface.source) if surface else (None, None)
+        scale = {"unit": unit, "scale_from": source}
+        images.append({**image, "camera": _camera(camera), **scale})
         job.done(len(paths))
     return {**job.record, "images": images}
 

@@ -98,7 +98,7 @@ class PanopticView(Segments):
         """`overlay` with a legend; `instanceIds`, 16 bits."""
         if kind == "overlay":
             return {"overlay": self.explained(image_HW3)}
-        return {"instanceIds": self.ids_HW.astype(np.uint16)}
+        return {"instanceIds": self.ids_HW.astype(np.uint16)} if kind == "ids" else {}
 
     @classmethod
     def key(cls, views: Sequence[View]) -> Key:
