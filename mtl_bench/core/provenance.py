@@ -49,8 +49,9 @@ def code(cell: Cell) -> Code:
         for stage, roots in HARNESS_ROOTS.items()
     }
     if cell.video:
-        labels = fingerprints("label", [*tasks, dataset])
-        found["train"] |= {f"labels by {part}": code for part, code in labels.items()}
+        made = fingerprints("label", [*tasks, dataset])
+        labels = {f"labels by {part}": code for part, code in made.items()}
+        found["train"] = found["train"] | labels  # a new one: fingerprints are kept and shared
     return found
 
 
