@@ -2,7 +2,13 @@
 
 import numpy as np
 import pytest
+<<<<<<< HEAD
 from mtl_bench.tasks.depth.errors import (
+=======
+
+from mtl_bench.core import config
+from mtl_bench.tasks.depth.metrics import (
+>>>>>>> tests2
     NAMES,
     DepthErrors,
     depth_errors,

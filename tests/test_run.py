@@ -13,9 +13,13 @@ from mtl_bench.bench.run import run_cell
 from mtl_bench.bench.stored import load_model, reevaluate
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Cell, load_recipe, to_dict
+<<<<<<< HEAD
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.evaluate import pseudo_frames
+=======
+from mtl_bench.data import pseudo_frames
+>>>>>>> tests2
 from mtl_bench.train import checkpoint
 from mtl_bench.train.progress import Interrupted
 
@@ -139,13 +143,13 @@ def test_it_trains_on_both_kinds_of_labels(cells, finished, smoke_root, tmp_path
     from mtl_bench.train import loop as train
 
     copy_parent(cells, finished, tmp_path)
-    opened, open_dataset = [], train.open_dataset
+    opened, open_samples = [], train.open_samples
 
     def spy(*given, **settings):
-        opened.append(open_dataset(*given, **settings))
+        opened.append(open_samples(*given, **settings))
         return opened[-1]
 
-    monkeypatch.setattr(train, "open_dataset", spy)
+    monkeypatch.setattr(train, "open_samples", spy)
     row = execute(cells["video"], tmp_path, smoke_root)
     human = cells["video"].recipe.data.train_scenes
     assert [len(dataset) for dataset in opened] == [human + row["protocol"]["pseudo_frames"]]
@@ -255,11 +259,13 @@ def test_side_by_side_gives_each_networks_outputs(cells, finished):
         for name in ("apart", "panoptic", "depth")
     )
     image = torch.rand(2, 3, 32, 64)
-    both, first, second = (model.net(image) for model in (apart, panoptic, depth))
-    for name in ("semantic_BCHW", "center_B1HW", "offset_B2HW"):
-        assert torch.equal(getattr(both, name), getattr(first, name))
-    assert torch.equal(both.inverse_depth[0], second.inverse_depth[0])
-    assert apart.pose is None
+    both, first, second = (model.net(image).maps for model in (apart, panoptic, depth))
+    assert set(both["panoptic"]) == {"semantic", "center", "offset"}
+    assert set(both["depth"]) == {"inverse"}
+    for task, alone in (("panoptic", first), ("depth", second)):
+        for name, map_ in both[task].items():
+            assert torch.equal(map_, alone[task][name])
+    assert list(dict(apart.named_children())) == ["net"]  # no pose network
 
 
 # --- only what changed code concerns ---

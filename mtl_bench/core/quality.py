@@ -18,6 +18,7 @@ SIGNS = ast.UnaryOp | ast.UAdd | ast.USub | ast.Load
 T = TypeVar("T")
 
 
+<<<<<<< HEAD
 def declared(name: str) -> dict[str, Any]:
     """By task, what its class assigns to a name; every task is behind those it comes `after`.
 
@@ -26,6 +27,15 @@ def declared(name: str) -> dict[str, Any]:
     tasks = plugins.ordered(plugins.files("tasks"))
     found = {task: _read(task, plugins.path_of("tasks", task).read_bytes(), name) for task in tasks}
     return {task: value for task, value in found.items() if value is not None}
+=======
+def quality() -> tuple[Column, ...]:
+    """Of every task that can be read, each behind those whose results it reads."""
+    return tuple(
+        column
+        for name in plugins.ordered(plugins.readable("tasks"))
+        for column in _columns(name, plugins.path_of("tasks", name).read_bytes())
+    )
+>>>>>>> tests2
 
 
 @functools.cache
