@@ -18,7 +18,6 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from mtl_bench.tasks.finish import Finish
 from torch import Tensor
 
 from mtl_bench.core.batch import Camera
@@ -26,15 +25,10 @@ from mtl_bench.core.config import Evaluate, Recipe
 from mtl_bench.core.geometry import back_project, depth_from_inverse
 from mtl_bench.core.task import finish, tasks_of
 from mtl_bench.data.labels import CITYSCAPES20
-<<<<<<< HEAD
-from mtl_bench.tasks.panoptic import postprocess
-from mtl_bench.tasks.panoptic.grouping import nearest
-=======
 from mtl_bench.tasks import pixels
 from mtl_bench.tasks.depth.scale import dgc_scale
 from mtl_bench.tasks.panoptic import grouping
 from mtl_bench.tasks.panoptic.nearest_center import nearest
->>>>>>> tests2
 
 COUNTS = (5, 50, 200)
 THINGS = CITYSCAPES20.things

@@ -2,21 +2,15 @@
 
 import numpy as np
 import pytest
-<<<<<<< HEAD
-from mtl_bench.tasks.depth.errors import (
-=======
 
 from mtl_bench.core import config
 from mtl_bench.tasks.depth.metrics import (
->>>>>>> tests2
     NAMES,
     DepthErrors,
     depth_errors,
     evaluation_mask,
     median_scale,
 )
-
-from mtl_bench.core import config
 
 EV = config.Evaluate()
 TRUE = np.array([[2, 5, 10, 40, 79.9]])

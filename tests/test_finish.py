@@ -5,20 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from mtl_bench.tasks.finish import Finish
 
 from mtl_bench.core import config, geometry
 from mtl_bench.core.batch import Camera
 from mtl_bench.core.task import finish as finish_tasks
 from mtl_bench.core.task import tasks_of
 from mtl_bench.data.labels import CITYSCAPES20
-<<<<<<< HEAD
-from mtl_bench.tasks.panoptic import postprocess
-=======
 from mtl_bench.tasks.depth import scale
 from mtl_bench.tasks.depth.scale import dgc_scale
 from mtl_bench.tasks.panoptic import grouping
->>>>>>> tests2
 
 THINGS = CITYSCAPES20.things
 ROAD, SKY, EGO = (CITYSCAPES20.index(name) for name in ("road", "sky", "ego vehicle"))

@@ -10,11 +10,6 @@ import numpy as np
 import pytest
 from cityscapesscripts.evaluation import evalPanopticSemanticLabeling as csEval
 from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
-<<<<<<< HEAD
-from mtl_bench.evaluate.export_predictions import write_panoptic
-from mtl_bench.tasks.panoptic.iou import SemanticIoU
-from mtl_bench.tasks.panoptic.quality import VOID, PanopticQuality, Segments, Tally, match
-=======
 
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.evaluate.delta import delta_flat, delta_task
@@ -27,10 +22,6 @@ from mtl_bench.tasks.panoptic.metrics import (
     Tally,
     match,
 )
->>>>>>> tests2
-
-from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
-from mtl_bench.evaluate.delta import delta_flat, delta_task
 
 PUBLISHED = Path(__file__).parents[2] / "shared/data/deeplab2_testdata/evaluation"
 

@@ -292,7 +292,7 @@ def test_tasks_stand_behind_those_whose_results_they_read(tmp_path):
     with pytest.raises(ValueError, match=r"no task called 'dept' \(did you mean 'depth'\?\)"):
         plugins.ordered(["dept"])
     put(tmp_path / "tasks" / "mmm.py", TASK.replace('("depth",)', "('aaa',)"))
-    with pytest.raises(ValueError, match="tasks wait for each other: .*mmm"):
+    with pytest.raises(ValueError, match=r"tasks wait for each other: .*mmm"):
         plugins.ordered(["aaa", "mmm", "zzz"])
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mtl_bench.tasks.panoptic.quality import PanopticQuality
 
 from mtl_bench.core import config
 from mtl_bench.core.labels import IGNORE
@@ -17,13 +16,9 @@ from mtl_bench.core.task import tasks_of
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.tasks import pixels
 from mtl_bench.tasks.depth import scale as depth_scale
-<<<<<<< HEAD
-from mtl_bench.tasks.panoptic import postprocess
-=======
 from mtl_bench.tasks.depth.scale import dgc_scale
 from mtl_bench.tasks.panoptic import grouping
 from mtl_bench.tasks.panoptic.metrics import PanopticQuality
->>>>>>> tests2
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 THINGS = CITYSCAPES20.things

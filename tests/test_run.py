@@ -13,13 +13,7 @@ from mtl_bench.bench.run import run_cell
 from mtl_bench.bench.stored import load_model, reevaluate
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Cell, load_recipe, to_dict
-<<<<<<< HEAD
-from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.data.loader import open_dataset
-from mtl_bench.evaluate import pseudo_frames
-=======
 from mtl_bench.data import pseudo_frames
->>>>>>> tests2
 from mtl_bench.train import checkpoint
 from mtl_bench.train.progress import Interrupted
 
@@ -347,19 +341,11 @@ def test_and_otherwise_it_is_stale_for_training(together, rows):
 @pytest.mark.parametrize("name", ["together", "apart"])
 def test_latency_alone_can_be_taken_again(name, cells, finished, rows, smoke_root, monkeypatch):
     cell, before = cells[name], rows[name]
-    seen = []
-    monkeypatch.setattr(
-        "mtl_bench.bench.stored.measure",
-        lambda *given: seen.append(given) or {"latency.mean_ms": 12.5},
-    )
+    monkeypatch.setattr("mtl_bench.bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
     arguments = [str(finished / cell.slug / "cell.json"), "--latency", "--runs", str(finished)]
     done = CliRunner().invoke(app, ["train", *arguments, "--data", str(smoke_root)])
     assert done.exit_code == 0, done.output
     assert "12.5 ms a frame" in done.output
-    dataset = open_dataset(cell, cell.recipe.evaluate.split, smoke_root, training=False)
-    pitch_rad = float(dataset.sample(0, None).camera_pitch_rad_B)
-    assert pitch_rad != 0
-    assert seen[0][-2:] == (CITYSCAPES20.index("road"), pitch_rad)
     after = results.load_row(finished / cell.slug)
     assert after["metric"] == before["metric"] | {"latency.mean_ms": 12.5}
     assert after["time"].keys() == before["time"].keys()

@@ -155,31 +155,12 @@ def _kind_of(path: Path) -> str | None:
 
 
 @functools.cache
-<<<<<<< HEAD
 def _derives(path: Path, kind: str) -> bool:
     """Whether a file of this package defines a class that descends from a kind's contract."""
     module, base = BASES[kind]
     contract = of_package(module.removeprefix("mtl_bench.")), base
-    return any(contract in ancestry(path, name) for name in load_text(path).statements)
-=======
-def _derived(folder: Path, base: str) -> set[Path]:
-    """Files of a shipped folder that define a public class whose bases lead, through the folder, to
-    one of this name or whose name ends with it."""
-    classes = [
-        (node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases}, path)
-        for path in _files_in(folder)
-        for node in _parse(path.read_bytes()).body
-        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
-    ]
-    names, found, size = {base, f"Graph{base}"}, set[Path](), -1
-    while len(found) > size:  # a class may come before its base
-        size = len(found)
-        for name, bases, path in classes:
-            if bases & names:
-                names.add(name)
-                found.add(path)
-    return found
->>>>>>> tests2
+    public = (name for name in load_text(path).statements if not name.startswith("_"))
+    return any(contract in ancestry(path, name) for name in public)
 
 
 @functools.cache

@@ -18,24 +18,14 @@ SIGNS = ast.UnaryOp | ast.UAdd | ast.USub | ast.Load
 T = TypeVar("T")
 
 
-<<<<<<< HEAD
 def declared(name: str) -> dict[str, Any]:
     """By task, what its class assigns to a name; every task is behind those it comes `after`.
 
     Tasks that assign nothing are absent.
     """
-    tasks = plugins.ordered(plugins.files("tasks"))
+    tasks = plugins.ordered(plugins.readable("tasks"))
     found = {task: _read(task, plugins.path_of("tasks", task).read_bytes(), name) for task in tasks}
     return {task: value for task, value in found.items() if value is not None}
-=======
-def quality() -> tuple[Column, ...]:
-    """Of every task that can be read, each behind those whose results it reads."""
-    return tuple(
-        column
-        for name in plugins.ordered(plugins.readable("tasks"))
-        for column in _columns(name, plugins.path_of("tasks", name).read_bytes())
-    )
->>>>>>> tests2
 
 
 @functools.cache
@@ -86,7 +76,7 @@ def columns_of(task: str, name: str = "columns") -> list[Column]:
 
 def _columns(name: str) -> list[Column]:
     """Of every task that is found; an heir's own alone, as its task's are there."""
-    tasks = plugins.ordered(plugins.files("tasks"))
+    tasks = plugins.ordered(plugins.readable("tasks"))
     found = {c.name: c for task in tasks for c in columns_of(task, name)}
     return list(found.values())
 
