@@ -33,6 +33,7 @@ EXCLUDED = {
     *(
         "core.fingerprint",
         "core.columns",
+        "core.quality",
         "core.files",
         "core.quiet",
         "train.progress",

@@ -154,13 +154,13 @@ def _kind_of(path: Path) -> str | None:
 
 @functools.cache
 def _derived(folder: Path, base: str) -> set[Path]:
-    """Files of a shipped folder that define a class whose bases lead, through the folder, to one
-    of this name or whose name ends with it."""
+    """Files of a shipped folder that define a public class whose bases lead, through the folder, to
+    one of this name or whose name ends with it."""
     classes = [
         (node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases}, path)
         for path in _files_in(folder)
         for node in _parse(path.read_bytes()).body
-        if isinstance(node, ast.ClassDef)
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     ]
     names, found, size = {base, f"Graph{base}"}, set[Path](), -1
     while len(found) > size:  # a class may come before its base
@@ -237,6 +237,16 @@ def _attributes(text: bytes) -> Mapping[str, Any]:
     for name, value in _assigned(text):
         with contextlib.suppress(ValueError):  # not a literal
             found[name] = ast.literal_eval(value)
+    return found
+
+
+def readable(kind: str) -> list[str]:
+    """Names whose attributes can be read: of one file, which is Python."""
+    found = []
+    for name, paths in _candidates(kind).items():
+        with contextlib.suppress(SyntaxError, ValueError):  # ValueError: null bytes
+            _parse(paths[0].read_bytes())
+            found += [name] * (len(paths) == 1)
     return found
 
 

@@ -15,10 +15,10 @@ ALLOWED += (ast.UAdd, ast.USub, ast.Load)
 
 
 def quality() -> tuple[Column, ...]:
-    """Of every task that is found, each behind those whose results it reads."""
+    """Of every task that can be read, each behind those whose results it reads."""
     return tuple(
         column
-        for name in plugins.ordered(plugins.files("tasks"))
+        for name in plugins.ordered(plugins.readable("tasks"))
         for column in _columns(name, plugins.path_of("tasks", name).read_bytes())
     )
 
