@@ -44,7 +44,8 @@ def pseudo_inverse(C_KK: Tensor) -> Tensor:
     """Of a correlation matrix: directions within rounding of zero are left out."""
     eigenvalue_K, V_KK = torch.linalg.eigh(C_KK)
     inverse_K = torch.where(eigenvalue_K > ROUNDING, 1 / eigenvalue_K, 0.0)
-    return (V_KK * inverse_K) @ V_KK.T
+    found: Tensor = (V_KK * inverse_K) @ V_KK.T
+    return found
 
 
 def equal_projections(C_KK: Tensor) -> Tensor:
@@ -60,7 +61,8 @@ def root(G_KK: Tensor) -> Tensor:
     """R with R^T R = G, accurate in every column however different the norms are."""
     norm_K, C_KK = correlation(G_KK)
     eigenvalue_K, V_KK = torch.linalg.eigh(C_KK)
-    return eigenvalue_K.clamp_min(0).sqrt()[:, None] * V_KK.T * norm_K
+    found: Tensor = eigenvalue_K.clamp_min(0).sqrt()[:, None] * V_KK.T * norm_K
+    return found
 
 
 def least_squares(A_NK: Tensor, b_N: Tensor) -> Tensor:
@@ -107,6 +109,16 @@ def project_on_simplex(v_K: Tensor) -> Tensor:
     rank_K = torch.arange(1, len(v_K) + 1, dtype=v_K.dtype)
     shift_K = (sorted_K.cumsum(0) - 1) / rank_K  # were only the largest 1, 2, ... entries positive
     return (v_K - shift_K[sorted_K > shift_K][-1]).clamp_min(0)
+
+
+def descend(weight_K: Tensor, step_K: Tensor) -> Tensor:
+    """The nearest weights >= 0 to `weight - step` that have the same sum as before.
+
+    The sum is 1, less what tasks without labels in this batch have and keep.
+    """
+    sum_ = weight_K.sum().clamp_min(1e-12)  # 0 if absent tasks have everything
+    moved_K = (weight_K - step_K) / sum_
+    return sum_ * project_on_simplex(moved_K - moved_K.max())  # the same point, exact when far away
 
 
 def fair(G_KK: Tensor, power: float) -> Tensor:

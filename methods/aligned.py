@@ -9,7 +9,7 @@ correlations are within the rounding of float32, or a repeated task would shorte
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 
 from ._solvers import ROUNDING, correlation, root
 
@@ -17,9 +17,10 @@ from ._solvers import ROUNDING, correlation, root
 class Aligned(GradientMethod):
     """w = sqrt(l_min) V l^(-1/2) V^T 1 with G = V l V^T, over the components that are not zero"""
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         _, C_KK = correlation(G_KK)
         rank = int((torch.linalg.eigvalsh(C_KK) > ROUNDING).sum())  # that of G
         _, sigma_K, V_KK = torch.linalg.svd(root(G_KK))  # finer than eigenvalues, the squares
         sigma_R, V_RK = sigma_K[:rank].clamp_min(torch.finfo(G_KK.dtype).tiny), V_KK[:rank]
-        return (sigma_R[-1:] / sigma_R * V_RK.sum(1)) @ V_RK
+        found: Tensor = (sigma_R[-1:] / sigma_R * V_RK.sum(1)) @ V_RK
+        return found

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LookAheadMethod
+from mtl_bench.core.method import LookAheadMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._adam import Adam
@@ -38,9 +38,9 @@ class AutoLambda(LookAheadMethod):
         self.adam = Adam(self.lambda_T, lr)
 
     def direction_ahead(
-        self, J_KP: Tensor, loss_K: Tensor, ahead: Callable[[Tensor], Tensor], lr: float
+        self, J_KP: Tensor, step: Step, ahead: Callable[[Tensor], Tensor], lr: float
     ) -> tuple[Tensor, Tensor]:
-        here = self.present  # of the first batch: the second may lack other labels
+        here = step.present
         lambda_K = self.lambda_T[here]
         next_P = ahead(lambda_K.to(J_KP) @ J_KP).sum(0)
         grad_K = (-lr * (J_KP @ next_P)).to(lambda_K)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import correlation, finite, root, shortest_above
@@ -30,8 +30,8 @@ class CAGrad(GradientMethod):
         super().__init__(terms, seed)
         self.c = c
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
-        weight_K = torch.full_like(loss_K, 1 / len(loss_K))
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        weight_K = torch.full_like(step.loss_K, 1 / len(step.loss_K))
         square = weight_K @ finite(G_KK) @ weight_K
         present_K = G_KK.diagonal() > 0  # a zero gradient asks nothing of d
         if square > 0:

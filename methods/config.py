@@ -7,7 +7,7 @@ is taken by their correlations, K x K numbers. The direction is that of `imtl_g`
 
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 
 from ._solvers import correlation, equal_projections
 
@@ -15,7 +15,7 @@ from ._solvers import correlation, equal_projections
 class ConFIG(GradientMethod):
     """(sum_i g_i u) u with u = U^+ 1 / |U^+ 1|, U the unit gradients"""
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         norm_K, C_KK = correlation(G_KK)
         weight_K = equal_projections(C_KK)  # of unit gradients, adding up to U^+ 1
         projection_K = C_KK @ weight_K

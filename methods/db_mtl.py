@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._state import Rows
@@ -28,6 +28,8 @@ class DualBalancing(GradientMethod):
         decay: beta_k = beta / k^decay at step k; 0, or 0.5 in the paper's search.
     """
 
+    needs = "jacobian"
+    weighted_heads = True
     step: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0, beta: float = 0.9, decay: float = 0.0):
@@ -36,15 +38,15 @@ class DualBalancing(GradientMethod):
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
         self.average = Rows(len(terms))
 
-    def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
+    def direction(self, J_KP: Tensor, step: Step) -> tuple[Tensor, Tensor]:
         self.step += 1
         beta = self.beta / self.step.item() ** self.decay
-        log_K = 1 / (loss_K.to(J_KP) + EPS)
-        m_KP = torch.lerp(log_K[:, None] * J_KP, self.average.of(self.present, J_KP), beta)
-        self.average.keep(self.present, m_KP)
+        log_K = 1 / (step.loss_K.to(J_KP) + EPS)
+        m_KP = torch.lerp(log_K[:, None] * J_KP, self.average.of(step.present, J_KP), beta)
+        self.average.keep(step.present, m_KP)
         norm_K = torch.linalg.vector_norm(m_KP, dim=1, dtype=torch.float64)
         stretch_K = torch.where(norm_K > 0, norm_K.max() / norm_K, 0).to(J_KP)
         return stretch_K @ m_KP, stretch_K * log_K
 
-    def head_weights(self, weight_K: Tensor, loss_K: Tensor) -> Tensor:
-        return 1 / (loss_K + EPS)
+    def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
+        return 1 / (step.loss_K + EPS)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import project_on_dual_cone, regularized
@@ -27,7 +27,7 @@ class DualProj(GradientMethod):
         super().__init__(terms, seed)
         self.regularization = regularization
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         G_KK = regularized(G_KK, self.regularization)
-        mean_1K = torch.full_like(loss_K, 1 / len(loss_K))[None]
+        mean_1K = torch.full_like(step.loss_K, 1 / len(step.loss_K))[None]
         return project_on_dual_cone(G_KK, mean_1K)[0]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
 
 
@@ -39,15 +39,15 @@ class DynamicWeightAverage(LossMethod):
             self.register_buffer(name, torch.zeros(len(terms)))
         self.register_buffer("ratio_T", torch.ones(len(terms)))
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        ratio_K = self.ratio_T[self.present]
+    def total(self, step: Step) -> Tensor:
+        ratio_K = self.ratio_T[step.present]
         weight_K = len(ratio_K) * torch.softmax(ratio_K / self.temperature, 0)
-        self._remember(loss_K.detach())
-        return (weight_K * loss_K).sum()
+        self._remember(step)
+        return (weight_K * step.loss_K).sum()
 
-    def _remember(self, loss_K: Tensor) -> None:
-        self.sum_T[self.present] += loss_K
-        self.count_T[self.present] += 1
+    def _remember(self, step: Step) -> None:
+        self.sum_T[step.present] += step.loss_K.detach()
+        self.count_T[step.present] += 1
         full_T = self.count_T == self.window
         mean_T = self.sum_T / self.window
         compared_T = full_T & (self.mean_T > 0)

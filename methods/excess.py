@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._state import Rows
@@ -27,6 +27,7 @@ class ExcessMTL(GradientMethod):
             the built-in data has 100 steps each.
     """
 
+    needs = "jacobian"
     weighted_heads = True
     log_weight_T: Tensor  # logarithms, from which a weight can return after it was 0
     base_T: Tensor  # e(0)
@@ -43,21 +44,21 @@ class ExcessMTL(GradientMethod):
         self.register_buffer("count_T", zeros_T.clone())
         self.squares = Rows(len(terms))
 
-    def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
+    def direction(self, J_KP: Tensor, step: Step) -> tuple[Tensor, Tensor]:
         square_KP = J_KP**2
-        S_KP = self.squares.of(self.present, J_KP) + square_KP
-        self.squares.keep(self.present, S_KP)
+        S_KP = self.squares.of(step.present, J_KP) + square_KP
+        self.squares.keep(step.present, S_KP)
         excess_K = square_KP.div_((S_KP + 1e-7).sqrt_()).sum(1).to(self.base_T)
-        weight_K = self._reweigh(excess_K).to(J_KP)
+        weight_K = self._reweigh(excess_K, step.present).to(J_KP)
         return weight_K @ J_KP, weight_K
 
-    def _reweigh(self, excess_K: Tensor) -> Tensor:
-        self.count_T[self.present] += 1
-        warming_K = self.count_T[self.present] <= self.warm_up
-        self.base_T[self.present] += warming_K * excess_K / self.warm_up
-        gain_K = self.eta * excess_K / (self.base_T[self.present] + 1e-7)
-        before_K = self.log_weight_T[self.present]
+    def _reweigh(self, excess_K: Tensor, here: Tensor) -> Tensor:
+        self.count_T[here] += 1
+        warming_K = self.count_T[here] <= self.warm_up
+        self.base_T[here] += warming_K * excess_K / self.warm_up
+        gain_K = self.eta * excess_K / (self.base_T[here] + 1e-7)
+        before_K = self.log_weight_T[here]
         after_K = (before_K + gain_K.masked_fill(warming_K, 0)).log_softmax(0)
         after_K = after_K + before_K.logsumexp(0)  # the absent tasks' weights stay
-        self.log_weight_T[self.present] = after_K
+        self.log_weight_T[here] = after_K
         return after_K.exp()

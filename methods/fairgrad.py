@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import fair
@@ -32,5 +32,5 @@ class FairGrad(GradientMethod):
             raise ValueError(f"alpha {alpha} must be above 0; 0 is the plain sum, a fixed weight")
         self.alpha = alpha
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         return fair(G_KK, power=1 / self.alpha)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._adam import Adam
@@ -36,15 +36,15 @@ class Famo(LossMethod):
         self.register_buffer("xi_T", torch.zeros(len(terms)))
         self.adam = Adam(self.xi_T, lr, weight_decay=decay)
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        loss_K = loss_K.clamp_min(1e-8)
-        share_K = torch.softmax(self.xi_T[self.present], 0)
+    def total(self, step: Step) -> Tensor:
+        loss_K = step.loss_K.clamp_min(1e-8)
+        share_K = torch.softmax(self.xi_T[step.present], 0)
         constant = 1 / (share_K / loss_K.detach()).sum()
         return constant * (share_K * loss_K.log()).sum()
 
-    def after_step(self, before_K: Tensor, after_K: Tensor) -> None:
-        xi_K = self.xi_T[self.present]
+    def after_step(self, step: Step, after_K: Tensor) -> None:
+        xi_K = self.xi_T[step.present]
         share_K = torch.softmax(xi_K, 0)
-        fall_K = before_K.clamp_min(1e-8).log() - after_K.clamp_min(1e-8).log()
+        fall_K = step.loss_K.clamp_min(1e-8).log() - after_K.clamp_min(1e-8).log()
         grad_K = share_K * (fall_K - (share_K * fall_K).sum())  # softmax' Jacobian times the fall
-        self.xi_T[self.present] = self.adam.step(xi_K, grad_K, self.present)
+        self.xi_T[step.present] = self.adam.step(xi_K, grad_K, step.present)

@@ -11,7 +11,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.plain import did_you_mean
 from mtl_bench.core.task import loss_names
 from mtl_bench.core.terms import Term
@@ -50,5 +50,5 @@ class Fixed(LossMethod):
         weight = [float(weights.get(name, start[name])) for name in start]
         self.register_buffer("weight_T", torch.tensor(weight), persistent=False)
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        return (self.weight_T[self.present] * loss_K).sum()
+    def total(self, step: Step) -> Tensor:
+        return (self.weight_T[step.present] * step.loss_K).sum()

@@ -8,11 +8,11 @@ the mean logarithm, because the product itself under- or overflows with many los
 
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 
 
 class GeometricMean(LossMethod):
     """(L_1 L_2 ... L_K)^(1/K), so that w_i is this over K L_i"""
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        return loss_K.clamp_min(1e-8).log().mean().exp()
+    def total(self, step: Step) -> Tensor:
+        return step.loss_K.clamp_min(1e-8).log().mean().exp()

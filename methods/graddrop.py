@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 
@@ -25,11 +25,13 @@ class GradDrop(GradientMethod):
         leak: part of what is dropped that passes nevertheless; 0 in the paper's main results.
     """
 
+    needs = "jacobian"
+
     def __init__(self, terms: Sequence[Term], seed: int = 0, leak: float = 0.0):
         super().__init__(terms, seed)
         self.leak = leak
 
-    def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
+    def direction(self, J_KP: Tensor, step: Step) -> tuple[Tensor, Tensor]:
         tiny, size_KP = torch.finfo(J_KP.dtype).tiny, J_KP.abs()
         purity_P = (1 + J_KP.sum(0) / size_KP.sum(0).clamp_min(tiny)) / 2
         drawn_P = torch.rand(len(purity_P), dtype=J_KP.dtype, generator=self.generator)

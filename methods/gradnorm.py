@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._adam import Adam
@@ -43,19 +43,19 @@ class GradNorm(GradientMethod):
         self.register_buffer("start_T", torch.zeros(len(terms), dtype=torch.float64))
         self.adam = Adam(self.weight_T, lr)
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
-        weight_K = self.weight_T[self.present]
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        weight_K = self.weight_T[step.present]
         norm_K = G_KK.diagonal().sqrt().to(weight_K)
-        target_K = (weight_K * norm_K).mean() * self._pace(loss_K.to(weight_K)) ** self.alpha
+        target_K = (weight_K * norm_K).mean() * self._pace(step) ** self.alpha
         grad_K = torch.sign(weight_K * norm_K - target_K) * norm_K
-        moved_K = self.adam.step(weight_K, grad_K, self.present).clamp_min(LEAST)
-        self.weight_T[self.present] = moved_K * weight_K.sum() / moved_K.sum()  # absent: as before
+        moved_K = self.adam.step(weight_K, grad_K, step.present).clamp_min(LEAST)
+        self.weight_T[step.present] = moved_K * weight_K.sum() / moved_K.sum()  # absent: as before
         return weight_K
 
-    def _pace(self, loss_K: Tensor) -> Tensor:
+    def _pace(self, step: Step) -> Tensor:
         """r [K]: above 1 where a loss has fallen less than the others."""
-        start_K = self.start_T[self.present]
+        loss_K, start_K = step.loss_K.to(self.start_T), self.start_T[step.present]
         start_K = torch.where(start_K > 0, start_K, loss_K)
-        self.start_T[self.present] = start_K
+        self.start_T[step.present] = start_K
         left_K = loss_K / start_K.clamp_min(TINY)
         return left_K / left_K.mean().clamp_min(TINY)

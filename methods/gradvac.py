@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import finite
@@ -38,8 +38,8 @@ class GradVac(GradientMethod):
         phi_TT = torch.zeros(len(terms), len(terms), dtype=torch.float64)
         self.register_buffer("phi_TT", phi_TT)
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
-        here = (self.present[:, None], self.present)
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        here = (step.present[:, None], step.present)
         G_KK, phi_KK = finite(G_KK), self.phi_TT[here].cpu()
         weight_KK = torch.eye(len(G_KK), dtype=G_KK.dtype)  # row i: g_i' as a sum of gradients
         for i, weight_K in enumerate(weight_KK):

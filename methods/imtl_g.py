@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import correlation, equal_projections
@@ -28,7 +28,7 @@ class ImpartialGradient(GradientMethod):
         super().__init__(terms, seed)
         self.paper_sum = paper_sum
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         norm_K, C_KK = correlation(G_KK)
         weight_K = equal_projections(C_KK) / norm_K
         sum_ = weight_K.sum() if self.paper_sum else weight_K.abs().sum()

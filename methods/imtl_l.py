@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
 
 
@@ -26,6 +26,6 @@ class ImpartialLoss(LossMethod):
         super().__init__(terms, seed)
         self.log_scale_T = nn.Parameter(torch.full((len(terms),), init))
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        log_scale_K = self.log_scale_T[self.present]
-        return (log_scale_K.exp() * loss_K - log_scale_K).sum()
+    def total(self, step: Step) -> Tensor:
+        log_scale_K = self.log_scale_T[step.present]
+        return (log_scale_K.exp() * step.loss_K - log_scale_K).sum()

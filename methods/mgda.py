@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import finite, min_norm
@@ -32,11 +32,11 @@ class MGDA(GradientMethod):
             raise ValueError(f"normalize '{normalize}' is not one of none, l2, loss, loss+")
         self.normalize = normalize
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
-        scale_K = torch.ones_like(loss_K)
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        scale_K = torch.ones_like(step.loss_K)
         if self.normalize in ("l2", "loss+"):
             scale_K = scale_K * G_KK.diagonal().sqrt()
         if self.normalize in ("loss", "loss+"):
-            scale_K = scale_K * loss_K
+            scale_K = scale_K * step.loss_K
         scale_K = torch.where(scale_K > 0, scale_K, 1.0)
         return min_norm(finite(G_KK) / scale_K / scale_K[:, None]) / scale_K

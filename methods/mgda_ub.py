@@ -16,4 +16,4 @@ class MGDAUpperBound(MGDA):
         normalize: as in `mgda`.
     """
 
-    space = "representation"
+    needs = "representation"

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
-from ._simplex import descend
+from ._solvers import descend
 from ._state import Rows
 
 
@@ -30,6 +30,7 @@ class MoCo(GradientMethod):
         scaled: track L_i g_i / ||g_i||.
     """
 
+    needs = "jacobian"
     lambda_T: Tensor
     step: Tensor
 
@@ -51,16 +52,16 @@ class MoCo(GradientMethod):
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
         self.tracked = Rows(len(terms))
 
-    def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
+    def direction(self, J_KP: Tensor, step: Step) -> tuple[Tensor, Tensor]:
         self.step += 1
         shrink = self.step.item() ** -self.decay
-        y_KP = self.tracked.of(self.present, J_KP)
-        y_KP = y_KP - self.beta * shrink * (y_KP - self._h(J_KP, loss_K))
-        self.tracked.keep(self.present, y_KP)
-        lambda_K = self.lambda_T[self.present].cpu()
+        y_KP = self.tracked.of(step.present, J_KP)
+        y_KP = y_KP - self.beta * shrink * (y_KP - self._h(J_KP, step.loss_K))
+        self.tracked.keep(step.present, y_KP)
+        lambda_K = self.lambda_T[step.present].cpu()
         slope_K = (y_KP @ y_KP.T).double().cpu() @ lambda_K + self.rho * lambda_K
         lambda_K = descend(lambda_K, self.gamma * shrink * slope_K)
-        self.lambda_T[self.present] = lambda_K.to(self.lambda_T)
+        self.lambda_T[step.present] = lambda_K.to(self.lambda_T)
         weight_K = lambda_K.to(J_KP)
         return weight_K @ y_KP, weight_K
 

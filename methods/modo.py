@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import CrossMethod
+from mtl_bench.core.method import CrossMethod, Step
 from mtl_bench.core.terms import Term
 
-from ._simplex import descend
+from ._solvers import descend
 
 
 class MoDo(CrossMethod):
@@ -34,8 +34,8 @@ class MoDo(CrossMethod):
         equal_T = torch.full((len(terms),), 1 / len(terms), dtype=torch.float64)
         self.register_buffer("lambda_T", equal_T)
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
-        lambda_K = self.lambda_T[self.present].to(G_KK)
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        lambda_K = self.lambda_T[step.present].to(G_KK)
         lambda_K = descend(lambda_K, self.gamma * (G_KK @ lambda_K + self.rho * lambda_K))
-        self.lambda_T[self.present] = lambda_K.to(self.lambda_T)
+        self.lambda_T[step.present] = lambda_K.to(self.lambda_T)
         return lambda_K

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import fair
@@ -27,6 +27,7 @@ class Nash(GradientMethod):
         max_norm: of the shared direction, 1 in the authors' code; inf clips nothing.
     """
 
+    weighted_heads = True
     weight_T: Tensor
     step: Tensor
 
@@ -38,13 +39,13 @@ class Nash(GradientMethod):
         self.register_buffer("weight_T", torch.ones(len(terms), dtype=torch.float64))
         self.register_buffer("step", torch.zeros((), dtype=torch.int64))
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         if self.step % self.every == 0:
-            self.weight_T[self.present] = fair(G_KK, power=1.0).to(self.weight_T)
+            self.weight_T[step.present] = fair(G_KK, power=1.0).to(self.weight_T)
         self.step += 1
-        weight_K = self.weight_T[self.present].to(G_KK)
+        weight_K = self.weight_T[step.present].to(G_KK)
         norm = (weight_K @ G_KK @ weight_K).clamp_min(0).sqrt()  # of the shared direction
         return weight_K * (self.max_norm / norm).clamp(max=1.0)
 
-    def head_weights(self, weight_K: Tensor, loss_K: Tensor) -> Tensor:
-        return self.weight_T[self.present].to(weight_K)
+    def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
+        return self.weight_T[step.present].to(weight_K)

@@ -8,7 +8,7 @@ its own normal plane too, which the algorithm excludes and which fires once othe
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 
 from ._solvers import finite
 
@@ -16,7 +16,7 @@ from ._solvers import finite
 class PCGrad(GradientMethod):
     """sum_i g_i', where g_i' = g_i, and for all j != i: if g_i' g_j < 0, g_i' -= proj(g_i', g_j)"""
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         square_K = finite(G_KK).diagonal().tolist()
         weight_KK = torch.eye(len(G_KK), dtype=G_KK.dtype)  # row i: g_i' as a sum of gradients
         for i, weight_K in enumerate(weight_KK):

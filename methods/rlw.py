@@ -8,13 +8,13 @@ to 1, those of equal weighting to K: at the same learning rate its steps are K t
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 
 
 class RandomLossWeighting(LossMethod):
     """sum_i w_i L_i with w = softmax(n), n ~ N(0, I)"""
 
-    def total(self, loss_K: Tensor) -> Tensor:
+    def total(self, step: Step) -> Tensor:
         draw_T = torch.randn(len(self.terms), generator=self.generator)  # absent losses draw too
-        weight_K = torch.softmax(draw_T[self.present].to(loss_K), 0)
-        return (weight_K * loss_K).sum()
+        weight_K = torch.softmax(draw_T[step.present].to(step.loss_K), 0)
+        return (weight_K * step.loss_K).sum()

@@ -7,11 +7,11 @@ lower bound and turns negative: a schedule must watch a metric instead.
 
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 
 
 class ScaleInvariant(LossMethod):
     """sum_i log L_i, so that w_i = 1 / L_i"""
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        return loss_K.clamp_min(1e-8).log().sum()
+    def total(self, step: Step) -> Tensor:
+        return step.loss_K.clamp_min(1e-8).log().sum()

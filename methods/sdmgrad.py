@@ -12,11 +12,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import CrossMethod
+from mtl_bench.core.method import CrossMethod, Step
 from mtl_bench.core.terms import Term
 
-from ._simplex import descend
-from ._solvers import project_on_simplex
+from ._solvers import descend, project_on_simplex
 
 
 class SDMGrad(CrossMethod):
@@ -44,13 +43,13 @@ class SDMGrad(CrossMethod):
         self.lam, self.lr, self.momentum, self.iterations = lam, lr, momentum, iterations
         self.register_buffer("w_T", torch.full((len(terms),), 1 / len(terms), dtype=torch.float64))
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         scale = G_KK.diagonal().clamp_min(0).sqrt().mean()  # norms; noise can make them negative
         A_KK = G_KK / scale**2 if scale > 0 else G_KK
-        w_K = project_on_simplex(self.w_T[self.present].to(A_KK))  # a start: absent tasks drop out
+        w_K = project_on_simplex(self.w_T[step.present].to(A_KK))  # a start: absent tasks drop out
         velocity_K = torch.zeros_like(w_K)
         for _ in range(self.iterations):
             velocity_K = self.momentum * velocity_K + A_KK @ (w_K + self.lam / len(A_KK))
             w_K = descend(w_K, self.lr * velocity_K)
-        self.w_T[self.present] = w_K.to(self.w_T)
+        self.w_T[step.present] = w_K.to(self.w_T)
         return (w_K + self.lam / len(w_K)) / (1 + self.lam)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
 
 
@@ -35,13 +35,13 @@ class SmoothTchebycheff(LossMethod):
         self.register_buffer("sum_T", torch.zeros(len(terms)))
         self.register_buffer("count_T", torch.zeros(len(terms)))
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        loss_K = loss_K.clamp_min(1e-8)
-        warm_K = self.count_T[self.present] < self.warmup
-        mean_K = self.sum_T[self.present] / self.warmup
+    def total(self, step: Step) -> Tensor:
+        loss_K, here = step.loss_K.clamp_min(1e-8), step.present
+        warm_K = self.count_T[here] < self.warmup
+        mean_K = self.sum_T[here] / self.warmup
         f_K = (loss_K / torch.where(warm_K, 1.0, mean_K)).log()
-        self.sum_T[self.present] += warm_K * loss_K.detach()
-        self.count_T[self.present] += 1
+        self.sum_T[here] += warm_K * loss_K.detach()
+        self.count_T[here] += 1
         total, known_K = f_K[warm_K].sum(), f_K[~warm_K]
         if len(known_K) > 0:
             total = total + len(known_K) * self.mu * torch.logsumexp(known_K / self.mu, 0)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
 
 
@@ -30,7 +30,7 @@ class Uncertainty(LossMethod):
         tau = torch.tensor([1.0 if term.kind == "classification" else 0.5 for term in terms])
         self.register_buffer("tau_T", tau, persistent=False)
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        log_variance_K = self.log_variance_T[self.present]
-        precision_K = torch.exp(-log_variance_K)
-        return (self.tau_T[self.present] * precision_K * loss_K + 0.5 * log_variance_K).sum()
+    def total(self, step: Step) -> Tensor:
+        log_variance_K = self.log_variance_T[step.present]
+        weight_K = self.tau_T[step.present] * torch.exp(-log_variance_K)
+        return (weight_K * step.loss_K + 0.5 * log_variance_K).sum()

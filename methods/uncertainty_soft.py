@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import LossMethod
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
 
 
@@ -28,6 +28,6 @@ class UncertaintySoft(LossMethod):
             raise ValueError(f"temperature {temperature} must be positive")
         self.temperature = temperature
 
-    def total(self, loss_K: Tensor) -> Tensor:
-        precision_K = 1 / loss_K.detach().clamp_min(1e-8)
-        return (torch.softmax(precision_K / self.temperature, 0) * loss_K).sum()
+    def total(self, step: Step) -> Tensor:
+        precision_K = 1 / step.loss_K.detach().clamp_min(1e-8)
+        return (torch.softmax(precision_K / self.temperature, 0) * step.loss_K).sum()

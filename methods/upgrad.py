@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.method import GradientMethod, Step
 from mtl_bench.core.terms import Term
 
 from ._solvers import project_on_dual_cone, regularized
@@ -28,7 +28,7 @@ class UPGrad(GradientMethod):
         super().__init__(terms, seed)
         self.regularization = regularization
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
         G_KK = regularized(G_KK, self.regularization)
         own_KK = torch.eye(len(G_KK), dtype=G_KK.dtype) / len(G_KK)
         return project_on_dual_cone(G_KK, own_KK).sum(0)

@@ -48,7 +48,7 @@ def smoke_cell() -> Cell:
 @pytest.fixture
 def change_harness(monkeypatch):
     """Make the harness look edited, for some stages or all."""
-    from mtl_bench.bench import latency_runs
+    from mtl_bench.bench import jobs
     from mtl_bench.core import provenance
 
     real = provenance.fingerprints
@@ -58,7 +58,7 @@ def change_harness(monkeypatch):
             edited = {"harness": "edited"} if stage in stages or not stages else {}
             return real(stage, roots) | edited
 
-        for module in (provenance, latency_runs):
+        for module in (provenance, jobs):
             monkeypatch.setattr(module, "fingerprints", other)
 
     return change

@@ -12,8 +12,9 @@ import sys
 import time
 from pathlib import Path
 
-from mtl_bench.bench import claim, results
-from mtl_bench.bench.launch import CLAIMED
+from mtl_bench.bench import store
+from mtl_bench.core.files import write_json
+from mtl_bench.core.locks import CLAIMED, ClaimedError, claim
 
 
 def note(directory: Path, word: str) -> None:
@@ -33,27 +34,27 @@ def main() -> None:
     if action == "silent":
         sys.exit(0)
     try:
-        with claim.claim(directory):
+        with claim(directory):
             if (directory / "row.json").exists() and "--stale" not in options:
                 return
             if "--stale" in options:
-                results.set_aside(directory, "stale")
+                store.set_aside(directory, "stale")
             note(directory, "start")
-            results.write_json(directory / "code.json", json.loads(code))
+            write_json(directory / "code.json", json.loads(code))
             state = {"stage": "train", "step": 1, "steps": 2, "seconds": 1.0, "note": "loss 1"}
-            results.write_json(directory / "progress.json", state)
+            write_json(directory / "progress.json", state)
             time.sleep(float(seconds))
             if action == "fail":
-                results.write_failure(directory, "ValueError: on purpose", "Traceback ...")
+                store.write_failure(directory, "ValueError: on purpose", "Traceback ...")
                 sys.exit(1)
             if action == "crash":
                 print("about to crash", flush=True)
                 os.kill(os.getpid(), signal.SIGKILL)
             metric = {"panoptic.pq": 25.0, "latency.fps": 10.0}
             row = {"metric": metric, "code": json.loads(code), "time": {"train_s": 3600.0}}
-            results.write_json(directory / "row.json", row)
+            write_json(directory / "row.json", row)
             note(directory, "end")
-    except claim.ClaimedError:
+    except ClaimedError:
         sys.exit(CLAIMED)
     except KeyboardInterrupt:
         note(directory, "saved")

@@ -4,43 +4,44 @@ from functools import partial
 
 import pytest
 import torch
+from support.methods import step_of
+from support.terms import DEPTH, PANOPTIC, TERMS, WHOLE_TASKS
 from torch import nn
 
-from mtl_bench.bench.check.methods import TERMS, Quadratics
+from mtl_bench.bench.check.methods import Quadratics
 from mtl_bench.core import plugins
 from mtl_bench.core.method import Composed, CrossMethod, GradientMethod, LookAheadMethod, LossMethod
-from mtl_bench.core.terms import gather, terms_of
-from mtl_bench.train.backward import Pass, backward, losses_now
-from mtl_bench.train.gradients import frozen_statistics
+from mtl_bench.core.terms import gather
+from mtl_bench.train.backward import Pass, backward, frozen_statistics, losses_now
 
 
 class Sum(LossMethod):
-    def total(self, loss_K):
-        return loss_K.sum()
+    def total(self, step):
+        return step.loss_K.sum()
 
 
 class Squares(LossMethod):
     """Weights that depend on the losses."""
 
-    def total(self, loss_K):
-        return loss_K.square().sum()
+    def total(self, step):
+        return step.loss_K.square().sum()
 
 
 class SumOfGradients(GradientMethod):
-    def weights(self, G_KK, loss_K):
-        return torch.ones_like(loss_K)
+    def weights(self, G_KK, step):
+        return torch.ones_like(step.loss_K)
 
 
 class SumAtRepresentation(SumOfGradients):
-    space = "representation"
+    needs = "representation"
 
 
 class Halved(GradientMethod):
     weighted_heads = True
 
-    def weights(self, G_KK, loss_K):
+    def weights(self, G_KK, step):
         assert G_KK.dtype == torch.float64
-        return torch.full_like(loss_K, 0.5)
+        return torch.full_like(step.loss_K, 0.5)
 
 
 class ByNorm(GradientMethod):
@@ -48,12 +49,12 @@ class ByNorm(GradientMethod):
 
     weighted_heads = True
 
-    def weights(self, G_KK, loss_K):
-        return loss_K / G_KK.diag().sqrt()
+    def weights(self, G_KK, step):
+        return step.loss_K / G_KK.diag().sqrt()
 
 
 class ByNormAtRepresentation(ByNorm):
-    space = "representation"
+    needs = "representation"
 
 
 def grads(method, scale=1.0, toy=None, **options):
@@ -116,6 +117,36 @@ def test_weighted_heads_follow_the_weights():
     assert weighting.weights == {term.name: 0.5 for term in TERMS}
 
 
+def test_only_declared_head_weights_are_asked():
+    class Tripled(SumOfGradients):
+        def head_weights(self, weight_K, step):
+            return 3 * step.loss_K
+
+    class Declared(Tripled):
+        weighted_heads = True
+
+    toy, sum_own = Quadratics(TERMS), grads(SumOfGradients(TERMS))[1]
+    assert torch.equal(grads(Tripled(TERMS))[1], sum_own)
+    _, _, weighting = grads(Declared(TERMS), toy=toy)
+    own = torch.stack([toy.own[term.name].grad for term in TERMS])
+    torch.testing.assert_close(own, 6 * weighting.step.loss_K)  # a single loss's is 2
+    assert set(weighting.weights.values()) == {1.0}
+
+
+def test_a_method_that_needs_gradients_gets_them_and_their_direction_counts():
+    class Signs(GradientMethod):
+        needs = "jacobian"
+
+        def direction(self, J_KP, step):
+            assert J_KP.shape == (len(step.loss_K), 6)
+            return J_KP.sign().sum(0), torch.full_like(step.loss_K, 2.0)
+
+    shared, own, weighting = grads(Signs(TERMS))
+    assert torch.equal(shared, shared.round())
+    assert torch.equal(own, grads(SumOfGradients(TERMS))[1])
+    assert set(weighting.weights.values()) == {2.0}
+
+
 def test_weights_are_the_derivatives_of_the_total():
     weights = grads(plugins.load("methods", "fixed")(TERMS))[2].weights
     assert list(weights.values()) == pytest.approx([1, 200, 0.01, 1, 0.001])
@@ -135,7 +166,9 @@ def test_loss_scale_multiplies_every_gradient_and_no_weight(name):
 
 def test_overflow_reaches_the_scaler_and_not_the_method():
     class Never(GradientMethod):
-        def direction(self, J_KP, loss_K):
+        needs = "jacobian"
+
+        def direction(self, J_KP, step):
             raise AssertionError("the method saw an overflow")
 
     toy = Quadratics(TERMS)
@@ -206,10 +239,10 @@ def test_looking_at_losses_leaves_batch_norm_alone():
 
 @pytest.mark.parametrize("kind", [Sum, SumOfGradients])
 def test_a_missing_task_is_as_if_the_cell_never_had_it(kind):
-    names = tuple(term.name for term in terms_of(["depth"]))
+    names = tuple(term.name for term in DEPTH)
     net, other = TinyNet(), TinyNet()
     weighting = backward(kind(TERMS), [[partial(net, X, names)]], net)
-    backward(kind(terms_of(["depth"])), [[partial(other, X, names)]], other)
+    backward(kind(DEPTH), [[partial(other, X, names)]], other)
     assert tuple(weighting.weights) == names
     for one, two in zip(net.parameters(), other.parameters(), strict=True):
         assert (one.grad is None) == (two.grad is None)
@@ -223,7 +256,7 @@ def test_a_batch_without_any_labels_is_an_error():
 
 
 def test_a_task_is_the_sum_of_its_terms_at_fixed_weights():
-    tasks = terms_of(["panoptic", "depth"], "tasks")
+    tasks = WHOLE_TASKS
     assert [(t.name, t.task, t.fixed_weight) for t in tasks] == [
         ("panoptic", "panoptic", 1.0),
         ("depth", "depth", 1.0),
@@ -237,8 +270,8 @@ def test_a_task_is_the_sum_of_its_terms_at_fixed_weights():
 
 def test_fixed_weights_over_tasks_are_fixed_weights_over_terms():
     fixed = plugins.load("methods", "fixed")
-    tasks = terms_of(["panoptic", "depth"], "tasks")
-    for one, two in zip(net_grads(fixed(TERMS), [X]), net_grads(fixed(tasks), [X]), strict=True):
+    whole = net_grads(fixed(WHOLE_TASKS), [X])
+    for one, two in zip(net_grads(fixed(TERMS), [X]), whole, strict=True):
         torch.testing.assert_close(one, two)
 
 
@@ -257,7 +290,7 @@ def test_composition_weighs_the_rows_first():
 
 
 def test_composition_with_a_missing_task():
-    names = tuple(term.name for term in terms_of(["depth"]))
+    names = tuple(term.name for term in DEPTH)
     uncertain, net, other = plugins.load("methods", "fixed_uncertainty"), TinyNet(), TinyNet()
     composed = Composed(uncertain(TERMS), SumOfGradients(TERMS))
     weighting = backward(composed, [[partial(net, X, names)]], net)
@@ -280,10 +313,10 @@ def test_composition_travels_in_a_checkpoint():
 
 def test_independent_batches_are_compared_in_the_losses_that_all_have():
     class Last(CrossMethod):
-        def weights(self, G_KK, loss_K):
+        def weights(self, G_KK, step):
             assert G_KK.shape == (2, 2)
-            assert self.present.tolist() == [0, 4]
-            return torch.ones_like(loss_K)
+            assert step.present.tolist() == [0, 4]
+            return torch.ones_like(step.loss_K)
 
     net, names = TinyNet(), [term.name for term in TERMS]
     lists = (names, [names[0], names[4]], names[:1] + names[3:])
@@ -307,9 +340,9 @@ def cross_toy(kind, parts, scale=1.0):
 class ByCross(CrossMethod):
     """Weights that depend on all of the matrix, which is not symmetric."""
 
-    def weights(self, G_KK, loss_K):
+    def weights(self, G_KK, step):
         assert G_KK.dtype == torch.float64
-        return 1 + G_KK[0].abs() / (1 + G_KK.abs().sum()) + 0.1 * loss_K
+        return 1 + G_KK[0].abs() / (1 + G_KK.abs().sum()) + 0.1 * step.loss_K
 
 
 class ByCrossWithHeads(ByCross):
@@ -328,7 +361,7 @@ def test_cross_weights_come_from_two_batches_and_train_on_a_third(kind):
         J.append(torch.stack([torch.cat([g.flatten() for g in row]) for row in rows]))
         losses.append(torch.stack(values))
     A_KK, mean_K = (J[0] @ J[1].T).double(), (losses[0] + losses[1]).detach() / 2
-    weight_K = kind(TERMS).weights(A_KK, mean_K.double()).float()
+    weight_K = kind(TERMS).weights(A_KK, step_of(mean_K.double())).float()
     assert list(weighting.weights.values()) == pytest.approx(weight_K.tolist(), rel=1e-5)
     direction_P = weight_K @ J[2]
     torch.testing.assert_close(torch.cat([g.flatten() for g in found[: len(shared)]]), direction_P)
@@ -340,8 +373,8 @@ def test_cross_weights_come_from_two_batches_and_train_on_a_third(kind):
 
 def test_cross_batches_in_parts_and_a_loss_scale_change_nothing():
     class Fixed(CrossMethod):  # batch norm sees parts, so weights that depend on gradients differ
-        def weights(self, G_KK, loss_K):
-            return torch.arange(1.0, 6.0).to(loss_K)
+        def weights(self, G_KK, step):
+            return torch.arange(1.0, 6.0).to(step.loss_K)
 
     batches = [X[:4], X[4:8], X[8:]]
     whole, _ = cross_toy(Fixed, [[x] for x in batches])
@@ -360,10 +393,10 @@ def test_independent_batches_without_a_common_loss_are_refused():
 
 def test_look_ahead_sees_the_moved_point_and_leaves_it():
     class Looks(LookAheadMethod):
-        def direction_ahead(self, J_KP, loss_K, ahead, lr):
+        def direction_ahead(self, J_KP, step, ahead, lr):
             direction_P = J_KP.sum(0)
             self.there = ahead(direction_P), lr
-            return direction_P, torch.ones_like(loss_K)
+            return direction_P, torch.ones_like(step.loss_K)
 
     toy, method = Quadratics(TERMS), Looks(TERMS)
     point = toy.shared.detach().clone()
@@ -400,7 +433,7 @@ def test_fixed_uncertainty_equals_the_papers_loss(log_variance, expected):
     with torch.no_grad():
         method.log_variance_T.copy_(torch.tensor(log_variance))
     fixed = torch.tensor([1, 200, 0.01, 1, 0.001], dtype=torch.float64)
-    assert method.total(WEIGHTED / fixed).item() == pytest.approx(expected, abs=1e-6)
+    assert method.total(step_of(WEIGHTED / fixed)).item() == pytest.approx(expected, abs=1e-6)
 
 
 def test_uncertainty_is_stationary_where_the_theory_says():
@@ -409,11 +442,11 @@ def test_uncertainty_is_stationary_where_the_theory_says():
     loss_T = torch.tensor([0.7, 0.002, 3.0, 0.1, 0.05], dtype=torch.float64)
     with torch.no_grad():
         method.log_variance_T.copy_(torch.log(2 * method.tau_T * loss_T))
-    method.total(loss_T).backward()
+    method.total(step_of(loss_T)).backward()
     torch.testing.assert_close(method.log_variance_T.grad, torch.zeros(5, dtype=torch.float64))
 
 
 def test_state_is_tied_to_its_terms():
     method = plugins.load("methods", "uncertainty")
     with pytest.raises(ValueError, match="method state is for the terms"):
-        method(terms_of(["panoptic"])).load_state_dict(method(terms_of(["depth"])).state_dict())
+        method(PANOPTIC).load_state_dict(method(DEPTH).state_dict())

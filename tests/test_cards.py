@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.terms import TERMS
 from typer.testing import CliRunner
 
 from mtl_bench.cli.app import app
@@ -56,23 +57,18 @@ def test_the_median_file_is_short():
 @pytest.mark.parametrize("name", [path.stem for path in SHIPPED])
 def test_cards_say_what_the_classes_are(name):
     from mtl_bench.core.method import Composed, GradientMethod, LookAheadMethod, LossMethod
-    from mtl_bench.core.terms import terms_of
 
     (card,) = [card for card in cards.cards() if card.about.name == name]
     kind = plugins.load("methods", name)
-    method = kind(terms_of(("panoptic", "depth")))
+    method = kind(TERMS)
+    assert card.needs == method.needs
     gradient = method.gradient if isinstance(method, Composed) else method
     if isinstance(gradient, GradientMethod):
-        in_z = gradient.space == "representation"
-        assert card.needs == ("representation" if in_z else "gradients")
         assert card.cost.startswith(f"{method.batches}F + ")
-        weighted = (
-            kind.head_weights is not GradientMethod.head_weights if kind is type(gradient) else True
-        )
-        assert ("weighted decoders" in card.extras) == (gradient.weighted_heads or weighted)
+        weighted = gradient.weighted_heads or gradient is not method
+        assert ("weighted decoders" in card.extras) == weighted
     else:
         assert isinstance(method, LossMethod)
-        assert card.needs == "losses"
         assert card.cost == ("2F + 1B" if method.reevaluates else "1F + 1B")
     assert ("the losses after the step" in card.extras) == method.reevaluates
     ahead = "the gradients of a second batch ahead"
@@ -100,6 +96,7 @@ ICML 2031, arXiv:3101.00001, and not NeurIPS 2032.
 """
 
 from mtl_bench.core import method
+from mtl_bench.core.method import CrossMethod, GradientMethod, LossMethod
 {imports}
 
 class Mine({base}):
@@ -135,27 +132,27 @@ def test_source_formula_and_settings(tmp_path):
     [
         ("method.LossMethod", "x = 1", "losses", "1F + 1B", ()),
         ("LossMethod", "reevaluates = True", "losses", "2F + 1B", ("the losses after the step",)),
-        ("GradientMethod", "x = 1", "gradients", "1F + K(H + T)", ()),
-        ("CrossMethod", "x = 1", "gradients", "3F + 2K(H + T) + KH + 1T", ("3 batches",)),
-        ("GradientMethod", "space = 'representation'", "representation", "1F + KH + 1T", ()),
+        ("GradientMethod", "x = 1", "gramian", "1F + K(H + T)", ()),
+        ("CrossMethod", "x = 1", "gramian", "3F + 2K(H + T) + KH + 1T", ("3 batches",)),
+        ("GradientMethod", "needs = 'representation'", "representation", "1F + KH + 1T", ()),
         (
             "GradientMethod",
             "weighted_heads = True",
-            "gradients",
+            "gramian",
             "1F + K(H + T)",
             ("weighted decoders",),
         ),
         (
             "GradientMethod",
-            "def head_weights(self, w, l): ...",
-            "gradients",
+            "needs = 'jacobian'",
+            "jacobian",
             "1F + K(H + T)",
-            ("weighted decoders",),
+            (),
         ),
         (
             "method.LookAheadMethod",
             "x = 1",
-            "gradients",
+            "jacobian",
             "2F + 2K(H + T)",
             ("the gradients of a second batch ahead",),
         ),
@@ -168,7 +165,8 @@ def test_needs_and_cost(tmp_path, base, body, needs, cost, extras):
 
 def test_what_a_helper_beside_it_declares_counts(tmp_path):
     (tmp_path / "methods").mkdir()
-    helper = "class Base(GradientMethod):\n    batches = 2\n    space = 'representation'\n"
+    helper = "from mtl_bench.core.method import GradientMethod\n"
+    helper += "class Base(GradientMethod):\n    batches = 2\n    needs = 'representation'\n"
     (tmp_path / "methods" / "_base.py").write_text(helper)
     text = mine("Base", imports="from ._base import Base\n")
     card = card_of(tmp_path / "methods" / "mine.py", text)

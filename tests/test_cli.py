@@ -11,13 +11,14 @@ import pytest
 from test_launch import fake, history, hold
 from typer.testing import CliRunner
 
-from mtl_bench.bench import launch, results
+from mtl_bench.bench import jobs, store
 from mtl_bench.bench.grid import load_grid
-from mtl_bench.cli import grid as grid_commands
 from mtl_bench.cli import options
 from mtl_bench.cli.app import app
 from mtl_bench.core import fingerprint, plugins, provenance
-from mtl_bench.core.config import TASKS, Cell, load_recipe
+from mtl_bench.core.config import Cell, Recipe, load_recipe
+from mtl_bench.core.files import write_json
+from mtl_bench.core.locks import CLAIMED
 
 GRID = """question = "Does it work?"
 recipe = "smoke"
@@ -95,7 +96,7 @@ def test_new_in_a_folder_and_check_by_file(tmp_path):
     path = tmp_path / "place" / "mine.py"
     assert "mine" not in call("list", "methods")
     assert "Mine: one line" in call("list", "methods", "--plugins", "place")
-    path.write_text(path.read_text().replace("fixed_K * loss_K", "loss_K * float('nan')"))
+    path.write_text(path.read_text().replace("fixed_K * step.loss_K", "step.loss_K * float('nan')"))
     assert "FAILED" in call("check", path, code=1)
     assert "is no name" in one_line("new", "method", "Not-A-Name")
 
@@ -173,7 +174,7 @@ def test_a_full_disk_is_one_line_and_a_bug_is_not(monkeypatch):
         def raise_it(*args, **settings):
             raise error
 
-        monkeypatch.setattr("mtl_bench.bench.results.inspect", raise_it)
+        monkeypatch.setattr("mtl_bench.bench.store.inspect", raise_it)
 
     fail(OSError(28, "No space left on device", "runs/x"))
     assert "No space left on device: runs/x" in one_line("status", "--grid", "backbones")
@@ -192,18 +193,18 @@ def ablate(tmp_path, monkeypatch):
     runs, built = tmp_path / "runs", []
     (tmp_path / "mine.toml").write_text(GRID)
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
-    monkeypatch.setattr(grid_commands, "_baseline", lambda *given, **named: None)
+    monkeypatch.setattr("mtl_bench.bench.references.measure_trivial", lambda *given, **named: None)
 
     def build(grid, rows, out_dir, **given):
         built.append((grid.name, [row["status"] for row in rows], out_dir))
         run.rows = rows
         return out_dir / "index.html"
 
-    monkeypatch.setattr("mtl_bench.report.build", build)
+    monkeypatch.setattr("mtl_bench.report.grid.build", build)
 
     def run(*words, code=0, **behaviour):
         command = fake(runs, **behaviour)
-        monkeypatch.setattr(launch, "cell_command", lambda cell, *given: command(cell))
+        monkeypatch.setattr(jobs, "cell_command", lambda cell, *given: command(cell))
         return call("ablate", "--grid", "mine.toml", *words, code=code)
 
     run.runs, run.built, run.rows = runs, built, []
@@ -327,11 +328,11 @@ def test_rows_carry_their_delta_to_the_stored_baseline(ablate, tmp_path):
     cell = load_grid("mine.toml").cells[0]
     apart = Cell(cell.recipe, "tiny", "fixed", single_task=True)
     for each, factor in ((cell, 1.1), (apart, 1.0)):
-        directory = results.run_dir(each, ablate.runs)
+        directory = store.run_dir(each, ablate.runs)
         directory.mkdir(exist_ok=True)
         metric = {key: value * factor for key, value in numbers.items()}
         row = {"code": provenance.code(each), "metric": metric}
-        results.write_json(directory / "row.json", row)
+        write_json(directory / "row.json", row)
     call("report", "--grid", "mine.toml")
     # three of five metrics are a tenth better, two worse; of depth one and two; flat is a loss
     assert ablate.rows[0]["metric"]["delta.flat"] == pytest.approx(-2.0)
@@ -352,7 +353,7 @@ def train(tmp_path, monkeypatch):
     def run_cell(cell, directory, root, device, wandb, echo):
         seen.append((cell, device, wandb))
         run.behave(directory)
-        results.write_json(
+        write_json(
             directory / "row.json", {"code": provenance.code(cell), "metric": {}, "time": {}}
         )
 
@@ -395,9 +396,9 @@ def test_train_options_name_a_cell_of_any_kind(train):
 def test_train_runs_what_the_cell_needs_first(train):
     text = train(*CELL[:-2], "--single-task")
     assert "fixed tiny s0 single-task needs fixed tiny s0 panoptic first" in text
-    assert [cell.tasks for cell, *_ in train.seen] == [("panoptic",), ("depth",), TASKS]
+    assert [cell.tasks for cell, *_ in train.seen] == [("panoptic",), ("depth",), Recipe.tasks]
     for cell, *_ in train.seen:
-        assert results.status(cell, Path("runs")) == "done"
+        assert store.status(cell, Path("runs")) == "done"
     train(*CELL[:-2], "--single-task", "--rerun")
     assert len(train.seen) == 4  # not its parents
     assert "needs" not in train(*CELL)
@@ -410,11 +411,11 @@ def test_train_stops_at_a_parent_that_fails_and_leaves_the_child_alone(train):
     train.behave = fail
     assert "on purpose" in train(*CELL[:-2], "--video", code=2)
     cell = Cell(load_recipe("smoke"), "tiny", "fixed", video=True)
-    assert results.status(cell.parents[0], Path("runs")) == "failed"
-    assert results.status(cell, Path("runs")) == "missing"
+    assert store.status(cell.parents[0], Path("runs")) == "failed"
+    assert store.status(cell, Path("runs")) == "missing"
     train.behave = lambda directory: None
     train(*CELL[:-2], "--video")
-    assert results.status(cell, Path("runs")) == "done"
+    assert store.status(cell, Path("runs")) == "done"
 
 
 def test_train_does_not_build_on_a_stale_parent(train, change_harness):
@@ -454,19 +455,19 @@ def test_train_writes_down_why_it_failed(train):
     train.behave = fail
     assert "on purpose" in train(*CELL, code=2)
     cell = Cell(load_recipe("smoke"), "tiny", "fixed", ("depth",))
-    state = results.inspect(cell, Path("runs"))
+    state = store.inspect(cell, Path("runs"))
     assert (state.word, state.why) == ("failed", "ValueError: on purpose")
     failure = json.loads((Path("runs") / cell.slug / "failed.json").read_text())
     assert "in fail\n" in failure["traceback"]
     train.behave = lambda directory: None
     train(*CELL)
-    assert results.status(cell, Path("runs")) == "done"
+    assert store.status(cell, Path("runs")) == "done"
 
 
 def test_train_leaves_a_claimed_cell_alone(train):
     cell = Cell(load_recipe("smoke"), "tiny", "fixed", ("depth",))
     hold(Path("runs") / cell.slug, os.getppid())
-    assert "is being run by process" in train(*CELL, code=launch.CLAIMED)
+    assert "is being run by process" in train(*CELL, code=CLAIMED)
     assert train.seen == []
 
 
@@ -478,7 +479,7 @@ def test_train_tells_when_a_checkpoint_is_of_other_code(train, change_harness):
     train.behave = stop
     assert "interrupted" in train(*CELL, code=130)
     cell = Cell(load_recipe("smoke"), "tiny", "fixed", ("depth",))
-    assert results.status(cell, Path("runs")) == "interrupted"
+    assert store.status(cell, Path("runs")) == "interrupted"
     change_harness()
     train.behave = lambda directory: None
     assert "starting over (harness changed); what there was is kept" in train(*CELL)

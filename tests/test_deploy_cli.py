@@ -8,9 +8,10 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from mtl_bench import deploy as build
 from mtl_bench.cli import deploy
 from mtl_bench.cli.app import app
+from mtl_bench.deploy import maps, timer
+from mtl_bench.deploy.subject import untrained
 
 SMALL = ["--backbone", "tiny", "--recipe", "smoke", "--size", "32x64"]
 
@@ -60,10 +61,8 @@ def test_wrong_usage_is_one_line(words, why):
 
 @pytest.mark.usefixtures("threads")
 def test_a_wrong_engine_ends_with_1(tmp_path, monkeypatch):
-    from mtl_bench.engines import timed
-
     wrong = {"agreement.panoptic_equal": 0.5}
-    monkeypatch.setattr(timed, "_measured", lambda *args: ("wrong", "differs from plain", wrong))
+    monkeypatch.setattr(timer, "_measured", lambda *args: ("wrong", "differs from plain", wrong))
     result = invoke("latency", *SMALL, "--engine", "eager")
     assert result.exit_code == 1
     assert "wrong: differs from plain" in result.output
@@ -87,7 +86,7 @@ def test_all_runs_every_engine_in_a_process_of_its_own(tmp_path, monkeypatch):
     result = invoke(*words)
     assert result.exit_code == 0, result.output
     assert [row["engine"] for row in json.loads(file.read_text())] == [
-        *("plain", "eager", "compile", "onnxruntime", "openvino", "tensorrt")
+        *("plain", "compile", "eager", "onnxruntime", "openvino", "tensorrt")
     ]
     assert all(command[:3] == [sys.executable, "-m", "mtl_bench"] for command in seen)
     lines = result.output.splitlines()
@@ -108,16 +107,16 @@ def test_random_weights_see_no_more_things_than_a_street_has():
     from mtl_bench.core.config import TASKS
     from mtl_bench.data.labels import CITYSCAPES20
 
-    _, model = build.untrained("tiny", "smoke", TASKS)
+    _, model = untrained("tiny", "smoke", TASKS)
     image = torch.randint(0, 256, (1, 64, 128, 3), dtype=torch.uint8)
     before = model.net.heads["semantic"][1].weight.clone()
-    build.name_classes(model, image, CITYSCAPES20.things)
+    maps.name_classes(model, image, CITYSCAPES20.things)
     after = model.net.heads["semantic"][1].weight
     assert sorted(before.sum((1, 2, 3)).tolist()) == sorted(after.sum((1, 2, 3)).tolist())
     with torch.no_grad():
         seen = model.net(image.permute(0, 3, 1, 2) / 255).semantic_BCHW.argmax(1)
     share = sum(float((seen == thing).float().mean()) for thing in CITYSCAPES20.things)
-    assert share <= build.THINGS_SHARE + 1e-6
+    assert share <= maps.THINGS_SHARE + 1e-6
 
 
 def test_export_prints_the_names(tmp_path):

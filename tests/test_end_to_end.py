@@ -20,8 +20,8 @@ from mtl_bench.core.method import LossMethod
 
 
 class Mine(LossMethod):
-    def total(self, loss_T):
-        return loss_T.clamp_min(1e-8).log().sum()
+    def total(self, step):
+        return step.loss_K.clamp_min(1e-8).log().sum()
 '''
 GRID = """
 question = "Does everything run?"

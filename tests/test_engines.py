@@ -1,5 +1,6 @@
 """Engines: the same maps as the plain network's, said before a time; and a row whatever happens."""
 
+import importlib.util
 import itertools
 import math
 import re
@@ -12,18 +13,19 @@ import torch.nn.functional as F
 from small_networks import SIZE, images, model, subject
 from torch import Tensor, nn
 
-from mtl_bench import engines
-from mtl_bench.core import config
-from mtl_bench.engines import agreement, roofline, timed
-from mtl_bench.engines.base import Maps, Setting
-from mtl_bench.engines.eager import Eager
-from mtl_bench.engines.folding import NORM, fold
-from mtl_bench.engines.graph import Body, strided
-from mtl_bench.engines.upsample import Upsample
+from mtl_bench.core.engine import Setting
+from mtl_bench.core.recipe import Recipe
+from mtl_bench.deploy import agreement, engines, roofline, timer
+from mtl_bench.deploy.graph import NORM, Body, Upsample, fold, strided
+from mtl_bench.deploy.maps import Maps, infos
 
 CPU = torch.device("cpu")
-PLAN = timed.Plan(passes=4, seconds=None, batch=2, threads=1, compared=2)
-HERE = [n for n in engines.NAMES if n != "tensorrt" and engines.available(n) is None]
+TASKS = Recipe.tasks
+CLASSES = "panoptic.semantic.class"
+MAPS = ("panoptic.semantic", "panoptic.center", "panoptic.offset", "depth.inverse")
+PLAN = timer.Plan(passes=4, seconds=None, batch=2, threads=1, compared=2)
+Eager = engines.load("eager")
+HERE = [n for n in engines.names() if n != "tensorrt" and engines.available(n) is None]
 
 
 def setting(precision: str = "fp32", batch: int = 1) -> Setting:
@@ -104,22 +106,22 @@ def test_chunks_leave_no_trace(monkeypatch):
     torch.manual_seed(0)
     logits_1Chw = torch.randn(1, 20, 8, 16)
     whole = Upsample((8, 16), SIZE, CPU).classes(logits_1Chw)
-    monkeypatch.setattr("mtl_bench.engines.upsample.CHUNK", 1)
+    monkeypatch.setattr("mtl_bench.deploy.graph.CHUNK", 1)
     assert torch.equal(Upsample((8, 16), SIZE, CPU).classes(logits_1Chw), whole)
 
 
 # --- engines --------------------------------------------------------------------------------------
 
 
-AGREE = [(n, config.TASKS) for n in HERE if n != "compile"]
+AGREE = [(n, TASKS) for n in HERE if n != "compile"]
 AGREE += [("plain", ("depth",)), ("eager", ("depth",)), ("eager", ("panoptic",))]
 
 
 @pytest.mark.parametrize(("name", "tasks"), AGREE)
 def test_an_engine_agrees_with_plain(name, tasks):
-    what = subject("resnet18" if tasks == config.TASKS else "tiny", tasks)
+    what = subject("resnet18" if tasks == TASKS else "tiny", tasks)
     with torch.inference_mode():
-        found = timed.compare(what, timed.make(what, name, setting()), images=2)
+        found = timer.compare(what, timer.make(what, name, setting()), images=2)
     assert found.wrong("fp32") == ""
     assert ("agreement.panoptic_equal" in found.values()) == ("panoptic" in tasks)
     assert ("agreement.depth_median_rel" in found.values()) == ("depth" in tasks)
@@ -129,7 +131,7 @@ def test_an_engine_agrees_with_plain(name, tasks):
 @pytest.mark.skipif("compile" not in HERE, reason="no C++ compiler")
 def test_compile_agrees_with_plain():
     with torch.inference_mode():
-        found = timed.compare(subject(), timed.make(subject(), "compile", setting()), images=2)
+        found = timer.compare(subject(), timer.make(subject(), "compile", setting()), images=2)
     assert found.wrong("fp32") == ""
 
 
@@ -137,27 +139,29 @@ def test_compile_agrees_with_plain():
 def test_a_batch_is_its_images(name):
     what = subject()
     with torch.inference_mode():
-        one, two = (timed.make(what, name, setting(batch=n)) for n in (1, 2))
-        batch = two.network(two.transfer(torch.cat(what.images[:2])))
+        one, two = (timer.make(what, name, setting(batch=n)) for n in (1, 2))
+        batch = two.run(two.transfer(torch.cat(what.images[:2])))
         for number, image in enumerate(what.images[:2]):
-            single = one.network(one.transfer(image))
-            assert torch.equal(batch.class_BHW[number], single.class_BHW[0])
-            assert torch.allclose(batch.inverse_B1HW[number], single.inverse_B1HW[0], atol=1e-4)
+            single = one.run(one.transfer(image))
+            assert torch.equal(batch[CLASSES][number], single[CLASSES][0])
+            assert torch.allclose(
+                batch["depth.inverse"][number], single["depth.inverse"][0], atol=1e-4
+            )
 
 
 def test_bf16_is_another_precision():
     what = subject("resnet18")
     with torch.inference_mode():
-        found = timed.compare(what, timed.make(what, "eager", setting("bf16")))
-    assert found.logits_max > 1e-3
+        found = timer.compare(what, timer.make(what, "eager", setting("bf16")))
+    assert found.values()["agreement.logits_max"] > 1e-3
 
 
 def test_openvino_computes_in_float32_where_fp32_was_asked_for():
     pytest.importorskip("openvino")
     what = subject("resnet18")
     with torch.inference_mode():
-        found = timed.compare(what, timed.make(what, "openvino", setting()))
-    assert found.logits_max < 1e-3  # bf16, its own default where there is AMX: 0.01 and more
+        found = timer.compare(what, timer.make(what, "openvino", setting()))
+    assert found.values()["agreement.logits_max"] < 1e-3  # bf16, its default on AMX: 0.01
 
 
 def test_a_precision_that_an_engine_lacks_says_what_it_has():
@@ -173,7 +177,7 @@ def test_a_precision_that_an_engine_lacks_says_what_it_has():
 class Wrong(Eager):
     """Fast and wrong: what it says of one map is changed."""
 
-    change = ("inverse", 1.01)
+    change = ("depth.inverse", 1.01)
 
     def strided(self, image: Tensor) -> dict[str, Tensor]:
         maps = super().strided(image)
@@ -184,16 +188,16 @@ class Wrong(Eager):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (("inverse", 1.01), "median relative depth difference 0.0099 .limit 0.001."),
-        (("inverse", float("nan")), "depth difference inf"),
-        (("offset", 1.01), "maps 0.0[0-9]+ of their deviation .limit 0.001."),
-        (("logits", float("nan")), "not finite"),
+        (("depth.inverse", 1.01), "median relative depth difference 0.0099 .limit 0.001."),
+        (("depth.inverse", float("nan")), "depth difference inf"),
+        (("panoptic.offset", 1.01), "maps 0.0[0-9]+ of their deviation .limit 0.001."),
+        (("panoptic.semantic", float("nan")), "not finite"),
     ],
 )
 def test_a_wrong_engine_is_caught_and_not_timed(monkeypatch, change, why):
     monkeypatch.setattr(Wrong, "change", change)
     monkeypatch.setattr(engines, "load", lambda name, load=engines.load: _wrong(name, load))
-    row = timed.row(subject(), "eager", "fp32", CPU, PLAN)
+    row = timer.row(subject(), "eager", "fp32", CPU, PLAN)
     assert row["status"] == "wrong"
     assert re.search(why, row["why"]), row["why"]
     assert not [key for key in row["metric"] if key.startswith("latency.")]
@@ -220,13 +224,12 @@ def test_agreement_of_known_differences():
     panoptic = torch.tensor([[[1000, 1000], [1000, 2000]]])
     maps = torch.tensor([[[[1.0, 2], [4, 8]]]])
 
-    def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, dict[str, Tensor]]:
+    def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, dict[str, Maps]]:
         offset = maps.expand(1, 2, 2, 2)
-        found = Maps(None, center_B1HW=maps, offset_B2HW=offset, logits_BChw=logits)
-        found.inverse_B1HW = 1 / depth
-        return found, {"panoptic": panoptic}
+        found = dict(zip(MAPS, (logits, maps, offset, 1 / depth), strict=True))
+        return found, {"panoptic": {"panoptic": panoptic}}
 
-    found = agreement.Agreement()
+    found = agreement.Agreement(infos(subject().tasks))
     other = depth * torch.tensor([1, 1, 1, 1.5]).view(2, 2)
     found.update(
         pass_of(maps, panoptic, depth), pass_of(maps + 0.5, torch.full_like(panoptic, 1000), other)
@@ -249,11 +252,11 @@ def test_one_far_value_is_no_wrong_engine_but_many_near_ones_are(precision):
     maps = torch.randn(1, 2, 100, 100, generator=generator)
 
     def judged(other: Tensor) -> str:
-        found = agreement.Agreement()
+        found = agreement.Agreement(infos(subject("tiny", ("panoptic",)).tasks))
         passes = [
             (
-                Maps(None, center_B1HW=it[:, :1], offset_B2HW=it, logits_BChw=it),
-                {"panoptic": torch.zeros(1, 100, 100)},
+                dict(zip(MAPS[:3], (it, it[:, :1], it), strict=True)),
+                {"panoptic": {"panoptic": torch.zeros(1, 100, 100)}},
             )
             for it in (maps, other)
         ]
@@ -281,7 +284,7 @@ KEYS = (
 
 
 def test_a_row_says_everything_and_its_stages_add_up():
-    row = timed.row(subject(), "eager", "fp32", CPU, PLAN)
+    row = timer.row(subject(), "eager", "fp32", CPU, PLAN)
     assert (row["status"], row["why"], row["weights"]) == ("done", "", "random")
     assert (row["height"], row["width"], row["backbone"]) == (*SIZE, "tiny")
     metric = row["metric"]
@@ -297,11 +300,11 @@ def test_a_row_says_everything_and_its_stages_add_up():
 
 
 def test_an_engine_that_is_not_there_has_a_row_that_says_how_to_install_it(monkeypatch):
-    find = engines.importlib.util.find_spec
+    find = importlib.util.find_spec
     monkeypatch.setattr(
-        engines.importlib.util, "find_spec", lambda name: None if name == "openvino" else find(name)
+        importlib.util, "find_spec", lambda name: None if name == "openvino" else find(name)
     )
-    row = timed.row(subject(), "openvino", "fp32", CPU, PLAN)
+    row = timer.row(subject(), "openvino", "fp32", CPU, PLAN)
     assert row["status"] == "unavailable"
     assert row["why"].endswith("pip install 'mtl-bench[onnx,openvino]'")
     assert row["metric"] == {}
@@ -312,13 +315,13 @@ def test_an_engine_that_breaks_has_a_row_that_says_why(monkeypatch):
         raise RuntimeError("no such\nkernel")
 
     monkeypatch.setattr(Eager, "strided", broken)
-    row = timed.row(subject(), "eager", "fp32", CPU, PLAN)
+    row = timer.row(subject(), "eager", "fp32", CPU, PLAN)
     assert (row["status"], row["why"]) == ("failed", "RuntimeError: no such kernel")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="for machines without CUDA")
 def test_tensorrt_says_what_it_lacks():
-    row = timed.row(subject(), "tensorrt", "fp16", CPU, PLAN)
+    row = timer.row(subject(), "tensorrt", "fp16", CPU, PLAN)
     assert row["status"] == "unavailable"
     assert "tensorrt" in row["why"] or "CUDA" in row["why"]
 
@@ -329,7 +332,7 @@ def test_tensorrt_says_what_it_lacks():
 def clocked(monkeypatch, times_ms: list[float]) -> list:
     """Stages of which only the second takes time: each pass the next of these."""
     clock, queue = {"s": 0.0}, iter(times_ms)
-    monkeypatch.setattr(timed.time, "perf_counter", lambda: clock["s"])
+    monkeypatch.setattr(timer.time, "perf_counter", lambda: clock["s"])
 
     def work(value):
         clock["s"] += next(queue) / 1000
@@ -341,34 +344,34 @@ def clocked(monkeypatch, times_ms: list[float]) -> list:
 def test_warm_up_ends_when_times_stop_falling(monkeypatch):
     falling = [100.0 - 3 * n for n in range(20)]
     stages = clocked(monkeypatch, falling + [40.0] * 50)
-    passes = timed.warm_up(stages, itertools.cycle(images(1)), CPU, None)
-    assert 22 <= passes <= 20 + 2 * timed.WINDOW
+    passes = timer.warm_up(stages, itertools.cycle(images(1)), CPU, None)
+    assert 22 <= passes <= 20 + 2 * timer.WINDOW
 
 
 def test_warm_up_has_a_cap_and_a_share_of_the_time_limit(monkeypatch):
     stages = clocked(monkeypatch, [1000.0 * 0.9**n for n in range(100)])
-    assert timed.warm_up(stages, itertools.cycle(images(1)), CPU, None) == timed.WARMUP
+    assert timer.warm_up(stages, itertools.cycle(images(1)), CPU, None) == timer.WARMUP
     stages = clocked(monkeypatch, [1000.0] * 100)
-    assert timed.warm_up(stages, itertools.cycle(images(1)), CPU, 6.5) == 3
+    assert timer.warm_up(stages, itertools.cycle(images(1)), CPU, 6.5) == 3
 
 
 def test_the_time_limit_leaves_a_least_number_of_passes(monkeypatch):
     stages = clocked(monkeypatch, [1000.0] * 100)
-    plan = timed.Plan(passes=90, seconds=5)
-    ms = timed.time_passes(stages, itertools.cycle(images(1)), CPU, plan)
-    assert len(ms) == timed.LEAST
+    plan = timer.Plan(passes=90, seconds=5)
+    ms = timer.time_passes(stages, itertools.cycle(images(1)), CPU, plan)
+    assert len(ms) == timer.LEAST
     stages = clocked(monkeypatch, [100.0] * 100)
-    ms = timed.time_passes(stages, itertools.cycle(images(1)), CPU, plan)
+    ms = timer.time_passes(stages, itertools.cycle(images(1)), CPU, plan)
     assert len(ms) == 51  # the one that passes the limit is kept
 
 
 def test_noise_is_said():
     steady = np.array([[0, 100.0 + n % 3, 0] for n in range(40)])
-    assert timed.spread(steady) == {"spread": pytest.approx(0.02, abs=0.01), "noisy": False}
+    assert timer.spread(steady) == {"spread": pytest.approx(0.02, abs=0.01), "noisy": False}
     slower = np.array([[0, 100.0 + n / 4, 0] for n in range(40)])
-    assert timed.spread(slower)["noisy"]  # by its drift
+    assert timer.spread(slower)["noisy"]  # by its drift
     wild = np.array([[0, 100.0 + 50 * (n % 2), 0] for n in range(40)])
-    assert timed.spread(wild)["noisy"]  # by its spread
+    assert timer.spread(wild)["noisy"]  # by its spread
 
 
 def test_work_of_a_network_is_that_of_its_convolutions(monkeypatch):
@@ -398,13 +401,14 @@ def test_trained_weights_over_the_val_split(name):
     found = sorted(Path("runs").glob("*/last.pt"))
     if not found:
         pytest.skip("no trained run in runs/")
-    from mtl_bench import deploy
+    from mtl_bench.bench import stored
     from mtl_bench.data import scenes as synthetic
+    from mtl_bench.deploy import subject as subjects
 
-    cell, trained = deploy.from_checkpoint(found[0], None)
-    what = deploy.subject(
+    cell, trained = stored.deployed(found[0], None)
+    what = subjects.subject(
         cell, trained, SIZE, synthetic.ensure(cell.recipe.data), CPU, True, images=20
     )
     with torch.inference_mode():
-        result = timed.compare(what, timed.make(what, name, setting()), 20)
+        result = timer.compare(what, timer.make(what, name, setting()), 20)
     assert result.wrong("fp32") == ""

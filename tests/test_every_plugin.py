@@ -1,16 +1,19 @@
-"""Every file in methods/ and backbones/ passes the checks that come with being there."""
+"""Every file in methods/, backbones/ and engines/ passes the checks that come with being there."""
 
 import pytest
 
 from mtl_bench.bench.check import check
 from mtl_bench.core import plugins
 
-PLUGINS = [(kind, name) for kind in plugins.KINDS for name in plugins.files(kind)]
+SLOW = [("engines", "compile")]  # a compiler's run for every precision
+PLUGINS = [
+    pytest.param(kind, name, id=f"{kind}-{name}", marks=[pytest.mark.slow] * ((kind, name) in SLOW))
+    for kind in plugins.KINDS
+    for name in plugins.files(kind)
+]
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), PLUGINS, ids=[f"{kind}-{name}" for kind, name in PLUGINS]
-)
+@pytest.mark.parametrize(("kind", "name"), PLUGINS)
 def test_plugin(kind, name):
     failed = [f"{result.name}: {result.detail}" for result in check(kind, name) if not result.ok]
     assert failed == []
@@ -29,7 +32,8 @@ class Broken(LossMethod):
         super().__init__(terms, seed)
         self.count = 0
 
-    def total(self, loss_K):
+    def total(self, step):
+        loss_K = step.loss_K
         self.count += 1
         {line}
 '''
@@ -43,7 +47,8 @@ from mtl_bench.core.method import GradientMethod
 
 
 class Broken(GradientMethod):
-    def weights(self, G_KK, loss_K):
+    def weights(self, G_KK, step):
+        loss_K = step.loss_K
         {line}
 '''
 
@@ -78,7 +83,17 @@ def test_a_wrong_method_is_caught(tmp_path, monkeypatch, line, caught):
         ("return torch.rand_like(loss_K)", "same seed, same update"),
         ("return torch.arange(len(loss_K)) + 1.0", "order of losses"),
         ("return self.fixed_T.double()", "missing labels"),
+        ("G_KK.zero_(); return torch.ones_like(loss_K)", "finite on hard inputs"),
     ],
 )
 def test_a_wrong_gradient_method_is_caught(tmp_path, monkeypatch, line, caught):
     assert caught in failed_checks(tmp_path, monkeypatch, BROKEN_GRADIENT.format(line=line))
+
+
+def test_a_space_of_what_the_constructor_does_not_take_is_caught(tmp_path, monkeypatch):
+    text = BROKEN.replace("(LossMethod):", "(LossMethod):\n    space = {space}")
+    for space, caught in (("{'seed': [1, 2]}", False), ("{'rate': [1e-3]}", True)):
+        failed = failed_checks(
+            tmp_path, monkeypatch, text.format(space=space, line="return loss_K.sum()")
+        )
+        assert ("space of hyper-parameters" in failed) == caught

@@ -8,11 +8,12 @@ import pytest
 import torch
 from small_networks import SIZE, images, model
 
-from mtl_bench import export
 from mtl_bench.core import config
 from mtl_bench.core.config import load_recipe
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.engines.agreement import equal_share
+from mtl_bench.deploy import export
+from mtl_bench.deploy.agreement import equal_share
+from mtl_bench.deploy.maps import finish_of
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -98,7 +99,7 @@ def test_inside_is_what_torch_computes(tmp_path):
     (path,) = written(tmp_path, "inside")
     assert names(path) == (["image", *CAMERA], RESULTS[config.TASKS])
     net = model("tiny").net
-    finish = export._finish(CITYSCAPES20, EVALUATE)
+    finish = finish_of(CITYSCAPES20, EVALUATE)
     for image in images(3):
         found = run(path, {"image": image.numpy(), **CAMERA})
         with torch.no_grad():

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import brentq
+from support.methods import head_weights, one_update, step_of, update
 
 from mtl_bench.core import plugins
-from mtl_bench.core.method import LookAheadMethod
 from mtl_bench.core.terms import Term
 
 torchjd = pytest.importorskip("torchjd.aggregation")
@@ -45,15 +45,6 @@ def sequence(steps, tasks, size=7, seed=0):
     kind = {"generator": draw, "dtype": torch.float64}
     J = torch.randn(steps, 3, tasks, size, **kind) + torch.randn(tasks, size, **kind)
     return list(zip(J, torch.rand(steps, 3, tasks, **kind) + 0.1, strict=True))
-
-
-def update(method, J_NKP, loss_NK):
-    """One answer, given as many of the three batches as the method takes."""
-    if isinstance(method, LookAheadMethod):
-        return method.direction_ahead(J_NKP[0], loss_NK[0], lambda direction_P: J_NKP[1], 0.1)
-    if method.batches == 1:
-        return method.direction(J_NKP[0], loss_NK[0])
-    return method.direction(J_NKP[: method.batches], loss_NK[: method.batches])
 
 
 def same(found, expected, tolerance=1e-10):
@@ -86,7 +77,7 @@ def test_gradnorm_is_algorithm_1():
         adam.step()
         with torch.no_grad():
             w.mul_(4 / w.sum())
-    assert method.head_weights(weight_K, loss_NK[0]) is weight_K
+    assert head_weights(method, weight_K, loss_NK[0]) is weight_K
 
 
 def test_gradnorm_keeps_weights_positive():
@@ -125,7 +116,7 @@ def test_db_mtl_is_algorithm_1(beta, decay):
         m_KP = beta_k * m_KP + (1 - beta_k) * log_K.numpy()[:, None] * J_NKP[0].numpy()
         norm_K = np.linalg.norm(m_KP, axis=1)
         same(direction_P, norm_K.max() * sum(m_KP[i] / norm_K[i] for i in range(4)))
-        same(method.head_weights(weight_K, loss_NK[0]), log_K)
+        same(head_weights(method, weight_K, loss_NK[0]), log_K)
     one_step = make("db_mtl", 4, beta=0.0)
     direction_P, weight_K = update(one_step, J_NKP, loss_NK)
     same(weight_K @ J_NKP[0], direction_P)  # the logged weights, without memory
@@ -169,7 +160,7 @@ def test_auto_lambda_descends_the_look_ahead_loss():
             return bowls.J(1, theta - lr * direction_P)
 
         direction_P, weight_K = method.direction_ahead(
-            J_KP, bowls.losses(0, theta).detach(), ahead, lr
+            J_KP, step_of(bowls.losses(0, theta).detach()), ahead, lr
         )
         adam.zero_grad()
         bowls.losses(1, theta - lr * (reference @ J_KP)).sum().backward()
@@ -177,7 +168,7 @@ def test_auto_lambda_descends_the_look_ahead_loss():
         same(weight_K, reference.detach())
         same(direction_P, reference.detach() @ J_KP)  # lambda first, then the network
         bowls.theta = theta - lr * direction_P
-    assert method.head_weights(weight_K, weight_K) is weight_K
+    assert head_weights(method, weight_K, weight_K) is weight_K
 
 
 def test_auto_lambda_hypergradient_by_finite_differences():
@@ -189,7 +180,7 @@ def test_auto_lambda_hypergradient_by_finite_differences():
         looked.append(direction_P)
         return bowls.J(1, bowls.theta - lr * direction_P)
 
-    method.direction_ahead(J_KP, bowls.losses(0, bowls.theta), ahead, lr)
+    method.direction_ahead(J_KP, step_of(bowls.losses(0, bowls.theta)), ahead, lr)
     same(looked[0], 0.1 * J_KP.sum(0))
     found_K = method.adam.first / (1 - 0.9)  # what Adam got at its first step
     for i in range(3):
@@ -237,12 +228,12 @@ def test_graddrop_is_torchjds(J_NKP, leak, monkeypatch):
     method = make("graddrop", len(J_KP), seed=7, leak=leak)
     copied = copy.deepcopy(method).generator
     drawn_P = torch.rand(J_KP.shape[1], dtype=J_KP.dtype, generator=copied)
-    direction_P, weight_K = method.direction(J_KP, torch.ones(len(J_KP)))
+    direction_P, weight_K = one_update(method, J_KP, torch.ones(len(J_KP)))
     with monkeypatch.context() as patch:
         patch.setattr(torch, "rand", lambda *args, **kwargs: drawn_P)
         leak_K = torch.full((len(J_KP),), leak, dtype=J_KP.dtype)
         same(direction_P, torchjd.GradDrop(leak=leak_K)(J_KP))
-    same(method.head_weights(weight_K, weight_K), np.ones(len(J_KP)))
+    same(head_weights(method, weight_K, weight_K), np.ones(len(J_KP)))
 
 
 @pytest.mark.parametrize("J_NKP", CASES)
@@ -252,7 +243,7 @@ def test_excess_is_torchjds(J_NKP):
     reference = torchjd.ExcessMTLWeighting(robust_step_size=0.3, n_warmup_steps=2)
     for step in range(6):
         J_KP = J_NKP[step % 3] * 0.9**step
-        direction_P, weight_K = method.direction(J_KP, torch.ones(tasks))
+        direction_P, weight_K = one_update(method, J_KP, torch.ones(tasks))
         same(weight_K, reference(J_KP))
         same(direction_P, weight_K @ J_KP)
     assert weight_K.std() > 1e-4
@@ -288,7 +279,7 @@ def test_sdmgrad_is_torchjds(J_NKP):
 def test_graddrop_without_conflict_is_the_sum():
     for sign in (1, -1):
         J_KP = sign * sequence(1, 4, 5000)[0][0][0].abs().float()
-        direction_P, weight_K = make("graddrop", 4).direction(J_KP, torch.ones(4))
+        direction_P, weight_K = one_update(make("graddrop", 4), J_KP, torch.ones(4))
         assert torch.equal(direction_P, J_KP.sum(0))
         same(weight_K, np.ones(4), 1e-6)
 
@@ -296,7 +287,8 @@ def test_graddrop_without_conflict_is_the_sum():
 @pytest.mark.parametrize("leak", [0.0, 0.25])
 def test_graddrop_on_average_weighs_the_signs_by_purity(leak):
     draws, J_KP = 40_000, sequence(1, 4)[0][0][0]
-    direction_P, _ = make("graddrop", 4, leak=leak).direction(J_KP.repeat(1, draws), torch.ones(4))
+    method = make("graddrop", 4, leak=leak)
+    direction_P, _ = one_update(method, J_KP.repeat(1, draws), torch.ones(4))
     found_P = direction_P.view(draws, -1).mean(0)
     plus_P, minus_P = J_KP.clamp_min(0).sum(0), J_KP.clamp_max(0).sum(0)
     purity_P = plus_P / (plus_P - minus_P)
@@ -379,15 +371,13 @@ def test_an_absent_task_keeps_its_state(name):
         for J_NKP, loss_NK in before:
             update(method, J_NKP, loss_NK)
         old = {key: value.clone() for key, value in method.named_buffers() if value.ndim}
-        method.present = here
-        direction_P, weight_K = update(method, last[0][:, here], last[1][:, here])
+        direction_P, weight_K = update(method, last[0][:, here], last[1][:, here], here)
         assert weight_K.shape == (2,)
         assert torch.isfinite(direction_P).all()
         for key, value in method.named_buffers():
             if value.ndim and old[key].numel():
                 assert torch.equal(value[1], old[key][1]), key
                 assert "rows" not in key or not torch.equal(value[0], old[key][0]), key
-        method.present = torch.arange(3)
         direction_P, _ = update(method, *last)
         assert torch.isfinite(direction_P).all()
 
@@ -399,20 +389,20 @@ def test_an_absent_task_keeps_its_state(name):
 def test_the_present_tasks_keep_their_part_of_the_weight(name, state, total):
     method = quick(name, 3)
     for present in ([0, 1, 2], [0, 2], [1], [0, 1, 2]):
-        method.present = torch.tensor(present)
-        before = getattr(method, state)[method.present].sum().item()
+        here = torch.tensor(present)
+        before = getattr(method, state)[here].sum().item()
         for J_NKP, loss_NK in sequence(3, 3):
-            update(method, J_NKP[:, method.present], loss_NK[:, method.present])
-        same(getattr(method, state)[method.present].sum(), before)
+            update(method, J_NKP[:, here], loss_NK[:, here], here)
+        same(getattr(method, state)[here].sum(), before)
         same(getattr(method, state).sum(), total)
 
 
 def test_excess_weights_sum_to_1_over_all_tasks():
     method = quick("excess", 3)
     for present in ([0, 1, 2], [0, 2], [1]):
-        method.present = torch.tensor(present)
+        here = torch.tensor(present)
         for J_NKP, loss_NK in sequence(3, 3):
-            update(method, J_NKP[:, method.present], loss_NK[:, method.present])
+            update(method, J_NKP[:, here], loss_NK[:, here], here)
         same(method.log_weight_T.exp().sum(), 1.0)
 
 
@@ -440,7 +430,7 @@ def test_hard_inputs_stay_finite(name, size, loss):
         for loss_NK in (torch.full((3, 5), loss), torch.zeros(3, 5), torch.full((3, 5), loss)):
             given = J_NKP.clone()
             direction_P, weight_K = update(method, given, loss_NK)
-            head_K = method.head_weights(weight_K, loss_NK[0])
+            head_K = head_weights(method, weight_K, loss_NK[0])
             for tensor in (direction_P, weight_K, head_K, *method.buffers()):
                 assert torch.isfinite(tensor).all(), title
             assert torch.equal(given, J_NKP), title

@@ -10,8 +10,10 @@ import math
 import pytest
 import torch
 from scipy.optimize import minimize
+from support.methods import head_weights, one_update, step_of
+from support.terms import TERMS
 
-from mtl_bench.bench.check.methods import TERMS, Quadratics
+from mtl_bench.bench.check.methods import Quadratics
 from mtl_bench.core import plugins
 from mtl_bench.core.terms import Term
 from mtl_bench.train.backward import backward
@@ -35,7 +37,7 @@ def weigh(name, J_KP, loss_K=None, **settings):
     if name == "nash":
         settings.setdefault("max_norm", math.inf)
     loss_K = torch.ones(len(J_KP), **KIND) if loss_K is None else loss_K
-    return make(name, len(J_KP), **settings).weights(J_KP @ J_KP.T, loss_K)
+    return make(name, len(J_KP), **settings).weights(J_KP @ J_KP.T, step_of(loss_K))
 
 
 def solvers():
@@ -132,8 +134,8 @@ def test_mgda_normalizes_as_the_authors_do():
 
 
 def test_mgda_ub_is_mgda_on_the_representation():
-    assert make("mgda_ub", 2).space == "representation"
-    assert make("mgda", 2).space == "parameters"
+    assert make("mgda_ub", 2).needs == "representation"
+    assert make("mgda", 2).needs == "gramian"
     J_KP = draw(3)
     assert torch.equal(weigh("mgda", J_KP), weigh("mgda_ub", J_KP))
 
@@ -266,10 +268,10 @@ def test_aligned_takes_rounding_of_float32_for_zero():
     J_KP[3] = J_KP[0]
     G_KK = J_KP @ J_KP.T
     noisy_KK = (J_KP.float() * (1 + 1e-7 * draw(4, 1).float())).double()
-    loss_K = torch.ones(4, **KIND)
-    found_P = make("aligned", 4).weights(noisy_KK @ noisy_KK.T, loss_K) @ J_KP
+    step = step_of(torch.ones(4, **KIND))
+    found_P = make("aligned", 4).weights(noisy_KK @ noisy_KK.T, step) @ J_KP
     torch.testing.assert_close(
-        found_P, make("aligned", 4).weights(G_KK, loss_K) @ J_KP, rtol=1e-4, atol=1e-4
+        found_P, make("aligned", 4).weights(G_KK, step) @ J_KP, rtol=1e-4, atol=1e-4
     )
 
 
@@ -371,7 +373,7 @@ def test_gradvac_is_algorithm_1_on_the_gradients(K):
     phi_KK, loss_K = torch.zeros(K, K, **KIND), torch.ones(K, **KIND)
     for seed in range(6):
         J_KP = draw(K, seed) + 0.5 * draw(K)[:1]
-        found_P = method.weights(J_KP @ J_KP.T, loss_K) @ J_KP
+        found_P = method.weights(J_KP @ J_KP.T, step_of(loss_K)) @ J_KP
         expected_P = literal_gradvac(J_KP, phi_KK, 0.3, generator)
         torch.testing.assert_close(found_P, expected_P, rtol=1e-9, atol=1e-9)
         torch.testing.assert_close(method.phi_TT, phi_KK)
@@ -472,7 +474,7 @@ def test_hard_gradients_give_finite_answers(name, K, precision):
         for title, J_KP in hard_gradients(K):
             given_KP = (size * J_KP).to(precision)
             loss_K = torch.ones(len(J_KP), dtype=precision)
-            direction_P, weight_K = make(name, len(J_KP)).direction(given_KP, loss_K)
+            direction_P, weight_K = one_update(make(name, len(J_KP)), given_KP, loss_K)
             assert torch.isfinite(direction_P).all(), title
             assert torch.isfinite(weight_K).all(), title
             if title == "zero":
@@ -482,7 +484,7 @@ def test_hard_gradients_give_finite_answers(name, K, precision):
 @pytest.mark.parametrize("name", NAMES)
 def test_one_task_is_its_gradient(name):
     J_KP = draw(1)
-    direction_P, _ = make(name, 1).direction(J_KP, torch.ones(1, **KIND))
+    direction_P, _ = one_update(make(name, 1), J_KP, torch.ones(1, **KIND))
     assert torch.cosine_similarity(direction_P, J_KP[0], dim=0) > 1 - 1e-12
 
 
@@ -490,7 +492,7 @@ def test_one_task_is_its_gradient(name):
 def test_a_gramian_that_is_not_finite_is_an_error_that_shows_it(name):
     G_KK = torch.tensor([[1.0, float("inf")], [float("inf"), 2.0]], **KIND)
     with pytest.raises(ArithmeticError, match=r"not finite.*\[\[1\.0, inf\], \[inf, 2\.0\]\]"):
-        make(name, 2).weights(G_KK, torch.ones(2, **KIND))
+        make(name, 2).weights(G_KK, step_of(torch.ones(2, **KIND)))
 
 
 @pytest.mark.parametrize("name", ["mgda", "upgrad", "dualproj", "cagrad"])
@@ -538,14 +540,15 @@ def test_nash_reuses_weights_and_clips_only_the_direction():
     steps = [draw(3, seed) for seed in range(4)]
     solved = [weigh("nash", J_KP) for J_KP in steps]
     for step, J_KP in enumerate(steps):
-        direction_P, weight_K = method.direction(J_KP, torch.ones(3, **KIND))
+        direction_P, weight_K = one_update(method, J_KP, torch.ones(3, **KIND))
         bargained_K = solved[3 if step == 3 else 0]
-        torch.testing.assert_close(method.head_weights(weight_K, torch.ones(3)), bargained_K)
+        torch.testing.assert_close(head_weights(method, weight_K, torch.ones(3)), bargained_K)
         whole_P = bargained_K @ J_KP
         assert whole_P.norm() > 1
         torch.testing.assert_close(direction_P, whole_P / whole_P.norm())
         torch.testing.assert_close(weight_K @ J_KP, direction_P)  # logged as they act
-    free_P, weight_K = make("nash", 3, max_norm=math.inf).direction(steps[0], torch.ones(3, **KIND))
+    free = make("nash", 3, max_norm=math.inf)
+    free_P, weight_K = one_update(free, steps[0], torch.ones(3, **KIND))
     torch.testing.assert_close(free_P, weight_K @ steps[0])
     torch.testing.assert_close(weight_K, solved[0])
 
@@ -556,11 +559,11 @@ def test_an_absent_task_keeps_its_state():
     part_KP = J_KP[present]
     nash, vaccine = make("nash", 4), make("gradvac", 4, beta=0.5)
     for method in (nash, vaccine):
-        method.weights(J_KP @ J_KP.T, loss_K)
+        method.weights(J_KP @ J_KP.T, step_of(loss_K))
     weight_T, phi_TT = nash.weight_T.clone(), vaccine.phi_TT.clone()
     for method in (nash, vaccine):
-        method.present = present
-        assert len(method.weights(part_KP @ part_KP.T, loss_K[present])) == 3
+        step = step_of(loss_K[present], present)
+        assert len(method.weights(part_KP @ part_KP.T, step)) == 3
     assert nash.weight_T[1] == weight_T[1]
     torch.testing.assert_close(nash.weight_T[present], weigh("nash", part_KP))
     assert torch.equal(vaccine.phi_TT[1], phi_TT[1])
@@ -574,11 +577,11 @@ def test_state_goes_into_a_fresh_method(name):
     first, second = make(name, 5, seed=1, **settings), make(name, 5, seed=2, **settings)
     loss_K, steps = torch.ones(5, **KIND), [conflicting(5, seed) for seed in range(6)]
     for J_KP in steps[:3]:
-        first.direction(J_KP, loss_K)
+        one_update(first, J_KP, loss_K)
     second.load_state_dict(first.state_dict())
     for J_KP in steps[3:]:
         for mine, other in zip(
-            first.direction(J_KP, loss_K), second.direction(J_KP, loss_K), strict=True
+            one_update(first, J_KP, loss_K), one_update(second, J_KP, loss_K), strict=True
         ):
             assert torch.equal(mine, other)
 

@@ -3,8 +3,8 @@ import dataclasses
 import pytest
 
 from mtl_bench.bench import grid as grids
-from mtl_bench.bench import grid_file
 from mtl_bench.bench.grid import load_grid
+from mtl_bench.bench.jobs import CELLS, with_parents
 from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell, load_recipe
 
@@ -40,7 +40,7 @@ def write(tmp_path):
 def test_shipped_grids_expand_and_name_existing_plugins():
     assert "backbones" in grids.grid_names()
     for name in grids.grid_names():
-        if grid_file.kind_of(grid_file.read(name)) != grid_file.TRAINING:
+        if load_grid(name).kind is not CELLS:
             continue
         grid = load_grid(name)
         assert grid.name == name
@@ -48,7 +48,7 @@ def test_shipped_grids_expand_and_name_existing_plugins():
         assert grid.question.endswith("?")
         assert grids.question_of(name) == grid.question
         assert grid.cells
-        plugins.check_cells([*grid.cells, *(skip.cell for skip in grid.skips)])
+        plugins.check_cells([*grid.cells, *(skip.job for skip in grid.skips)])
 
 
 def test_a_grid_may_name_its_smoke_recipe(write):
@@ -78,7 +78,7 @@ def test_product_has_the_first_axis_slowest(write):
 
 def test_skipped_cells_keep_their_reason(write):
     skips = load_grid(write()).skips
-    assert [(s.cell.backbone, s.cell.seed, s.why) for s in skips] == [
+    assert [(s.job.backbone, s.job.seed, s.why) for s in skips] == [
         ("b", 0, "too large"),
         ("b", 1, "too large"),
     ]
@@ -247,8 +247,8 @@ def test_parents_come_first_each_once():
     plain = Cell(load_recipe("smoke"), "b", "m")
     panoptic, depth = (dataclasses.replace(plain, tasks=(task,)) for task in ("panoptic", "depth"))
     apart, video = (dataclasses.replace(plain, **{k: True}) for k in ("single_task", "video"))
-    assert grids.with_parents([apart, plain, video]) == (panoptic, depth, apart, plain, video)
-    assert grids.with_parents([video, plain, depth]) == (plain, video, depth)
+    assert with_parents([apart, plain, video]) == (panoptic, depth, apart, plain, video)
+    assert with_parents([video, plain, depth]) == (plain, video, depth)
 
 
 @pytest.mark.parametrize(
@@ -302,19 +302,20 @@ def test_the_ablation_has_the_papers_rows():
     apart, together, uncertainty, video = grid.cells
     assert apart.parents[0].tasks == ("panoptic",)
     assert video.parents == (uncertainty,)
-    assert len(grids.with_parents(grid.cells)) == 6
+    assert len(with_parents(grid.cells)) == 6
     assert all(grids.baseline_cell(cell, grid.baseline) == apart for cell in grid.cells)
     assert together.method_args == {}
 
 
 @pytest.mark.parametrize("recipe", ["smoke", "small", "cityscapes"])
 def test_the_controls_halve_and_double_under_any_recipe(recipe):
-    from mtl_bench.core.terms import TERMS
+    from mtl_bench.core.task import tasks_of_cell
 
     grid = load_grid("ablation-controls", recipe=recipe)
     cells = {grid.names[cell.id]: cell for cell in grid.cells}
+    terms = [term for task in tasks_of_cell(grid.cells[0]) for term in task.terms]
     halved = cells["Fixed, regression halved"].method_args["weights"]
-    assert halved == {t.name: t.fixed_weight / 2 for t in TERMS if t.kind == "regression"}
+    assert halved == {t.name: t.fixed_weight / 2 for t in terms if t.kind == "regression"}
     twice = cells["+ Uncertainty, twice the iterations"].recipe.optim.steps
     assert twice == 2 * load_recipe(recipe).optim.steps
     assert cells["Fixed + Video Sequence"].parents == (cells["Multi-Task Baseline"],)

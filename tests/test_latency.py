@@ -7,10 +7,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from mtl_bench import latency
 from mtl_bench.core import config
 from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.deploy import roofline, timer
+from mtl_bench.deploy.subject import prepare
 from mtl_bench.model import Outputs
 from mtl_bench.tasks import finish
 
@@ -65,7 +66,7 @@ def measure(
     device="cpu",
     **kwargs,
 ):
-    return latency.measure(
+    return timer.measure(
         FakeModel() if model is None else model,
         images(4) if given is None else given,
         K_33,
@@ -90,7 +91,7 @@ def test_keys_and_what_was_measured():
 
 def test_stages_add_up_and_percentiles_are_ordered():
     result = measure()
-    stages = sum(result[f"latency.{name}_ms"] for name in latency.STAGES)
+    stages = sum(result[f"latency.{name}_ms"] for name in timer.STAGES)
     assert stages == pytest.approx(result["latency.mean_ms"], rel=1e-9)
     assert result["latency.fps"] == pytest.approx(1000 / result["latency.mean_ms"])
     assert 0 < result["latency.p50_ms"] <= result["latency.p95_ms"] <= result["latency.p99_ms"]
@@ -99,7 +100,7 @@ def test_stages_add_up_and_percentiles_are_ordered():
 def test_each_time_goes_to_its_stage(monkeypatch):
     """A clock that only the test moves: transfer 1 ms, network 10 ms, post-processing 5 ms."""
     clock = {"s": 0.0}
-    monkeypatch.setattr(latency.time, "perf_counter", lambda: clock["s"])
+    monkeypatch.setattr(timer.time, "perf_counter", lambda: clock["s"])
 
     def costing(ms: float):
         def stage(value):
@@ -109,13 +110,13 @@ def test_each_time_goes_to_its_stage(monkeypatch):
         return stage
 
     stages = [costing(1), costing(10), costing(5)]
-    times = latency.time_pass(stages, torch.zeros(1), torch.device("cpu"))
+    times = timer.time_pass(stages, torch.zeros(1), torch.device("cpu"))
     assert times == pytest.approx([1, 10, 5])
 
 
 def test_statistics_of_known_times():
     total = [10.0, 10, 10, 10, 10, 10, 15, 15]  # the last quarter is half as slow again
-    result = latency.statistics(latency.np.array([[1, t - 3, 2] for t in total]))
+    result = timer.statistics(timer.np.array([[1, t - 3, 2] for t in total]))
     assert result["mean_ms"] == pytest.approx(11.25)
     assert result["fps"] == pytest.approx(1000 / 11.25)
     assert result["p50_ms"] == pytest.approx(10)
@@ -147,10 +148,10 @@ def test_peak_memory_counts_what_is_alive_at_once():
         view.add_(1)
         return view
 
-    host = torch.ones(latency.MIB // 4)
+    host = torch.ones(roofline.MIB // 4)
     with torch.no_grad():
-        peak, kind = latency._peak([first, second, third], host, torch.device("cpu"))
-    assert peak == int(3.5 * latency.MIB)
+        peak, kind = roofline.peak([first, second, third], host, torch.device("cpu"))
+    assert peak == int(3.5 * roofline.MIB)
     assert "alive" in kind
 
 
@@ -158,8 +159,8 @@ def test_peak_includes_weights_and_grows_with_the_image():
     model = FakeModel(("depth",))  # grouping depends on what is seen, depth on the size alone
     small = measure(model)
     large = measure(model, dataclasses.replace(TIMING, height=2 * HEIGHT, width=2 * WIDTH))
-    weights_mib = (CLASSES + 4) * 3 * 9 * 4 / latency.MIB
-    maps_mib = (CLASSES + 4) * HEIGHT * WIDTH * 4 / latency.MIB
+    weights_mib = (CLASSES + 4) * 3 * 9 * 4 / roofline.MIB
+    maps_mib = (CLASSES + 4) * HEIGHT * WIDTH * 4 / roofline.MIB
     assert small["latency.peak_mib"] > weights_mib + maps_mib
     # four times the maps; the depth's scale looks at a number of pixels that does not grow
     assert large["latency.peak_mib"] > 2 * small["latency.peak_mib"]
@@ -195,7 +196,7 @@ def test_another_size_scales_image_and_intrinsics():
     result = measure(model, timing)
     assert (result["latency.height"], result["latency.width"]) == (64, 96)
     assert model.net.seen[-1].shape == (1, 3, 64, 96)
-    _, K_133 = latency.prepare(images(1), K_33, timing, pin=False)
+    _, K_133 = prepare(images(1), K_33, timing, pin=False)
     assert K_133[0, 0].tolist() == pytest.approx([57.6 * 1.5, 0, 47.5])
     assert K_133[0, 1].tolist() == pytest.approx([0, 57.6 * 2, 31.5])
 
@@ -215,6 +216,24 @@ def test_only_the_tasks_present_are_finished(tasks, monkeypatch):
     assert ("group" in calls) == ("panoptic" in tasks)
     assert ("dgc_scale" in calls) == ("depth" in tasks)
     assert result["latency.postprocess_ms"] > 0
+
+
+def test_depth_is_scaled_from_the_road_and_the_pitch_that_were_given(monkeypatch):
+    seen = []
+    function = finish.dgc_scale
+
+    def spy(depth, K, height, road, pitch_rad_B):
+        seen.append((road, pitch_rad_B))
+        return function(depth, K, height, road, pitch_rad_B=pitch_rad_B)
+
+    monkeypatch.setattr(finish, "dgc_scale", spy)
+    model = FakeModel()
+    measure(model, road=0, pitch_rad=0.02)
+    road_BHW, pitch_rad_B = seen[-1]
+    assert pitch_rad_B.tolist() == pytest.approx([0.02])
+    with torch.inference_mode():
+        logits = model.net.conv(model.net.seen[-1])[:, :CLASSES]
+    assert torch.equal(road_BHW, logits.argmax(1) == 0)
 
 
 def test_the_model_keeps_its_mode_and_weights():
@@ -244,7 +263,7 @@ def test_nothing_to_time_is_an_error():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_cuda_events_time_the_same_stages():
-    result = latency.measure(
+    result = timer.measure(
         FakeModel().cuda(),
         images(4),
         K_33,
@@ -256,5 +275,5 @@ def test_cuda_events_time_the_same_stages():
     )
     assert result["latency.clock"] == "CUDA events"
     assert result["latency.network_ms"] > 0
-    stages = sum(result[f"latency.{name}_ms"] for name in latency.STAGES)
+    stages = sum(result[f"latency.{name}_ms"] for name in timer.STAGES)
     assert stages == pytest.approx(result["latency.mean_ms"], rel=1e-6)

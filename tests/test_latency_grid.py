@@ -14,11 +14,15 @@ import fake_latency
 import pytest
 from typer.testing import CliRunner
 
-from mtl_bench import engines
-from mtl_bench.bench import claim, grid_file, latency_grid, latency_runs, results, timing
-from mtl_bench.bench.timing import Timing
+from mtl_bench.bench import grid as grids
+from mtl_bench.bench import jobs, launch, references, store
+from mtl_bench.bench.grid import load_grid
+from mtl_bench.bench.jobs import TIMINGS, Timing
 from mtl_bench.cli.app import app
-from mtl_bench.core import config, fingerprint
+from mtl_bench.cli.display import Lines
+from mtl_bench.core import config, fingerprint, locks
+from mtl_bench.core.files import write_json
+from mtl_bench.deploy import engines
 
 FAKE = Path(__file__).with_name("fake_timing.py")
 GRID = """kind = "latency"
@@ -56,29 +60,27 @@ def write(tmp_path):
 
 
 def test_the_shipped_grid_has_what_the_paper_deploys():
-    grid = latency_grid.load("latency")
+    grid = load_grid("latency")
     assert grid.question.endswith("?")
-    assert {t.size for t in grid.timings} == {"384x1280", "512x1024", "1024x2048"}
-    assert {t.tasks for t in grid.timings} == {("panoptic",), ("panoptic", "depth")}
-    assert {t.engine for t in grid.timings} == set(engines.NAMES)
-    assert len({t.backbone for t in grid.timings}) == 4
-    assert {(t.passes, t.recipe, t.weights) for t in grid.timings} == {(500, "paper", None)}
-    assert len({t.id for t in grid.timings}) == len(grid.timings)
-    timing.check(grid.timings)
+    assert {t.size for t in grid.jobs} == {"384x1280", "512x1024", "1024x2048"}
+    assert {t.tasks for t in grid.jobs} == {("panoptic",), ("panoptic", "depth")}
+    assert {t.engine for t in grid.jobs} == set(engines.names())
+    assert len({t.backbone for t in grid.jobs}) == 4
+    assert {(t.passes, t.recipe, t.weights) for t in grid.jobs} == {(500, "paper", None)}
+    assert len({t.id for t in grid.jobs}) == len(grid.jobs)
+    TIMINGS.check(grid.jobs)
 
 
 def test_it_stands_in_the_list_and_is_no_grid_of_cells():
-    assert "latency" in grid_file.grid_names()
-    assert grid_file.question_of("latency") == latency_grid.load("latency").question
-    from mtl_bench.bench.grid import load_grid
-
+    assert "latency" in grids.grid_names()
+    assert grids.question_of("latency") == load_grid("latency").question
     with pytest.raises(ValueError, match="no cells to train"):
-        load_grid("latency")
+        _ = load_grid("latency").cells
 
 
 def test_product_less_skips_and_precisions_that_an_engine_lacks(write):
-    grid = latency_grid.load(write())
-    points = [(t.size, t.backbone, t.engine, t.precision) for t in grid.timings]
+    grid = load_grid(write())
+    points = [(t.size, t.backbone, t.engine, t.precision) for t in grid.jobs]
     own = [("plain", "fp32"), ("openvino", "fp32"), ("openvino", "bf16"), ("tensorrt", "fp32")]
     places = [("64x128", "tiny"), ("64x128", "resnet18"), ("32x64", "tiny")]
     assert points == [(*place, *each) for place in places for each in own]
@@ -89,33 +91,31 @@ def test_product_less_skips_and_precisions_that_an_engine_lacks(write):
 
 
 def test_on_cuda_the_engine_of_cuda_has_its_precisions(write):
-    grid = latency_grid.load(write(), device="cuda")
-    assert {t.device for t in grid.timings} == {"cuda"}
-    assert {t.precision for t in grid.timings if t.engine == "tensorrt"} == {"fp32", "bf16"}
+    grid = load_grid(write(), device="cuda")
+    assert {t.device for t in grid.jobs} == {"cuda"}
+    assert {t.precision for t in grid.jobs if t.engine == "tensorrt"} == {"fp32", "bf16"}
 
 
 def test_smoke_stands_in_place_of_axes_under_another_name(write):
-    grid = latency_grid.load(write(), smoke=True)
+    grid = load_grid(write(), smoke=True)
     assert grid.name == "mine-smoke"
     assert grid.smoke
-    assert {(t.size, t.passes) for t in grid.timings} == {("16x32", 2)}
-    assert {t.engine for t in grid.timings} == {"plain", "eager"}
-    shipped = latency_grid.load("latency", smoke=True)
-    assert {t.engine for t in shipped.timings} == {"plain", "eager", "onnxruntime", "openvino"}
-    assert len(shipped.timings) == 4
-    assert not {t.id for t in shipped.timings} & {
-        t.id for t in latency_grid.load("latency").timings
-    }
+    assert {(t.size, t.passes) for t in grid.jobs} == {("16x32", 2)}
+    assert {t.engine for t in grid.jobs} == {"plain", "eager"}
+    shipped = load_grid("latency", smoke=True)
+    assert {t.engine for t in shipped.jobs} == {"plain", "eager", "onnxruntime", "openvino"}
+    assert len(shipped.jobs) == 4
+    assert not {t.id for t in shipped.jobs} & {t.id for t in load_grid("latency").jobs}
 
 
 def test_settings_replace_an_axis_or_a_value(write):
     given = ["engine=plain", 'size=["8x8", "16x16", "8x8"]', "passes=7", "backbone.width=3"]
-    grid = latency_grid.load(write(), settings=given)
-    assert {(t.engine, t.passes) for t in grid.timings} == {("plain", 7)}
-    assert [t.size for t in grid.timings] == ["8x8", "8x8", "16x16"]  # equal ones count once
-    assert {dict(t.backbone_args)["width"] for t in grid.timings} == {3}
-    grid = latency_grid.load(write(), settings=['tasks=["depth"]', "quality.recipe=medium"])
-    assert {t.tasks for t in grid.timings} == {("depth",)}
+    grid = load_grid(write(), settings=given)
+    assert {(t.engine, t.passes) for t in grid.jobs} == {("plain", 7)}
+    assert [t.size for t in grid.jobs] == ["8x8", "8x8", "16x16"]  # equal ones count once
+    assert {dict(t.backbone_args)["width"] for t in grid.jobs} == {3}
+    grid = load_grid(write(), settings=['tasks=["depth"]', "quality.recipe=medium"])
+    assert {t.tasks for t in grid.jobs} == {("depth",)}
     assert grid.quality == {"recipe": "medium"}
 
 
@@ -136,7 +136,7 @@ def test_settings_replace_an_axis_or_a_value(write):
 def test_mistakes_come_with_file_and_line(write, old, new, message):
     assert old in GRID
     with pytest.raises(ValueError, match=message):
-        latency_grid.load(write(GRID.replace(old, new, 1)))
+        load_grid(write(GRID.replace(old, new, 1)))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_mistakes_come_with_file_and_line(write, old, new, message):
 )
 def test_wrong_settings(write, setting, message):
     with pytest.raises(ValueError, match=message):
-        latency_grid.load(write(), settings=[setting])
+        load_grid(write(), settings=[setting])
 
 
 @pytest.mark.parametrize(
@@ -164,12 +164,12 @@ def test_wrong_settings(write, setting, message):
 )
 def test_what_a_timing_names_exists(changes, message):
     with pytest.raises(ValueError, match=message):
-        timing.check([dataclasses.replace(Timing("tiny", "plain"), **changes)])
+        TIMINGS.check([dataclasses.replace(Timing("tiny", "plain"), **changes)])
 
 
 def test_the_backbones_axis_may_be_all(write):
     text = GRID.replace('backbone = ["tiny", "resnet18"]', 'backbone = "all"')
-    assert len({t.backbone for t in latency_grid.load(write(text)).timings}) > 4
+    assert len({t.backbone for t in load_grid(write(text)).jobs}) > 4
 
 
 # --- identity -------------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ def trained(tmp_path):
         recipe = config.load_recipe(changes.pop("recipe", "smoke"))
         cell = config.Cell(recipe, changes.pop("backbone", "tiny"), "fixed", **changes)
         (tmp_path / name).mkdir()
-        results.write_json(tmp_path / name / "cell.json", config.to_dict(cell))
+        write_json(tmp_path / name / "cell.json", config.to_dict(cell))
         return tmp_path / name
 
     return trained
@@ -221,14 +221,14 @@ def test_weights_count_by_the_cell_that_trained_them(write, trained):
 
     def load(folder):
         given = [f"weights.tiny={folder}", "recipe=smoke", "engine=plain", "size=64x128"]
-        return latency_grid.load(write(), settings=given).timings
+        return load_grid(write(), settings=given).jobs
 
     tiny, other_backbone = load(first)
     assert tiny.weights == str(first)
     assert other_backbone.weights is None
     assert load(second)[0].id == tiny.id
     assert load(other)[0].id != tiny.id
-    command = latency_runs.timing_command(tiny, Path("row.json"))
+    command = jobs.timing_command(tiny, Path("row.json"))
     assert command[command.index("--checkpoint") + 1] == str(first / "last.pt")
     assert "--backbone" not in command
 
@@ -245,12 +245,12 @@ def test_weights_count_by_the_cell_that_trained_them(write, trained):
 def test_weights_that_do_not_fit_are_refused(write, trained, changes, message):
     given = [f"weights.tiny={trained(**changes)}", "recipe=smoke"]
     with pytest.raises(ValueError, match=message):
-        latency_grid.load(write(), settings=given)
+        load_grid(write(), settings=given)
 
 
 def test_the_command_of_a_timing():
     one = Timing("tiny", "openvino", "bf16", "64x128", ("panoptic",), "cpu", 7, 2.5, "smoke")
-    words = latency_runs.timing_command(one, Path("row.json"), Path("data"))[3:]
+    words = jobs.timing_command(one, Path("row.json"), Path("data"))[3:]
     text = " ".join(words)
     for part in (
         "latency --engine openvino --precision bf16 --size 64x128 --tasks panoptic --passes 7 "
@@ -259,7 +259,7 @@ def test_the_command_of_a_timing():
         "--device cpu --data data --json row.json",
     ):
         assert part in text
-    assert "--recipe" not in latency_runs.timing_command(Timing("tiny", "plain"), Path("x"))
+    assert "--recipe" not in jobs.timing_command(Timing("tiny", "plain"), Path("x"))
 
 
 # --- running --------------------------------------------------------------------------------------
@@ -269,7 +269,21 @@ def test_the_command_of_a_timing():
 def timings(write):
     """Of three engines; TensorRT is nowhere."""
     given = ["size=64x128", "backbone=tiny", "precision=fp32"]
-    return latency_grid.load(write(), settings=given).timings
+    return load_grid(write(), settings=given).jobs
+
+
+class Said(Lines):
+    """Keeps the lines, and whether each is about something that went well."""
+
+    def __init__(self, lines):
+        super().__init__()
+        self.lines = lines
+
+    def say(self, line):
+        self.lines.append((line, True))
+
+    def ended(self, run, line, ok):
+        self.lines.append((line, ok))
 
 
 @pytest.fixture
@@ -288,11 +302,9 @@ def take(tmp_path):
                 del row["metric"]
             return [sys.executable, str(FAKE), action, str(file), json.dumps(row)]
 
-        def say(line, ok):
-            take.said.append((line, ok))
-
         missing = {"tensorrt": fake_latency.INSTALL} if lack is None else lack
-        latency_runs.run(todo, runs, command, lambda t: missing.get(t.engine), say, **given)
+        given["lack"] = lambda timing: missing.get(timing.engine)
+        launch.Launcher(runs, command, Said(take.said), **given).run(todo)
 
     def history():
         file = runs / "latency" / "history.txt"
@@ -303,7 +315,7 @@ def take(tmp_path):
 
 
 def words(timings, runs):
-    return [latency_runs.inspect(t, runs).word for t in timings]
+    return [store.inspect(t, runs).word for t in timings]
 
 
 def test_one_after_another_each_leaves_its_row(timings, take):
@@ -328,11 +340,11 @@ def test_one_after_another_each_leaves_its_row(timings, take):
 
 def test_done_rows_are_reused_and_what_lacks_is_taken(timings, take):
     take(timings[:1])
-    assert latency_runs.to_run(timings, take.runs) == list(timings[1:])
+    assert store.to_run(timings, take.runs) == list(timings[1:])
     take(timings[1:])
-    assert latency_runs.to_run(timings, take.runs) == [timings[2]]  # it may be installed by now
+    assert store.to_run(timings, take.runs) == [timings[2]]  # it may be installed by now
     take([timings[2]], lack={})
-    assert latency_runs.to_run(timings, take.runs) == []
+    assert store.to_run(timings, take.runs) == []
 
 
 @pytest.mark.parametrize(
@@ -346,53 +358,53 @@ def test_done_rows_are_reused_and_what_lacks_is_taken(timings, take):
 def test_one_failing_timing_costs_its_row_only(timings, take, action, why):
     take(timings[:2], {"plain": action})
     assert words(timings[:2], take.runs) == ["failed", "done"]
-    assert why in latency_runs.inspect(timings[0], take.runs).why
+    assert why in store.inspect(timings[0], take.runs).why
     (line,) = [line for line, ok in take.said if not ok]
     assert "FAILED" in line
     assert f"log: {take.runs}/latency/{timings[0].id}.log" in line
-    assert latency_runs.to_run(timings[:2], take.runs) == [timings[0]]
+    assert store.to_run(timings[:2], take.runs) == [timings[0]]
 
 
 def test_a_wrong_engine_has_no_time_and_is_tried_again_when_its_code_has_changed(
     timings, take, change_harness
 ):
     take(timings[:2], {"openvino": "wrong"})
-    state = latency_runs.inspect(timings[1], take.runs)
+    state = store.inspect(timings[1], take.runs)
     assert (state.word, state.why) == ("wrong", "logits differ by 3")
-    assert latency_runs.to_run(timings[:2], take.runs) == []
-    assert latency_runs.to_run(timings[:2], take.runs, "failed") == [timings[1]]
+    assert store.to_run(timings[:2], take.runs) == []
+    assert store.to_run(timings[:2], take.runs, "failed") == [timings[1]]
     change_harness()
     assert words(timings[:2], take.runs) == ["stale", "wrong"]  # it has no time to be stale
-    assert latency_runs.to_run(timings[:2], take.runs) == [timings[1]]  # it may be right by now
+    assert store.to_run(timings[:2], take.runs) == [timings[1]]  # it may be right by now
 
 
 def test_rerun(timings, take, change_harness):
     take(timings[:2])
-    assert latency_runs.to_run(timings[:2], take.runs, "stale") == []
-    assert latency_runs.to_run(timings[:2], take.runs, "all") == list(timings[:2])
-    assert latency_runs.to_run(timings[:2], take.runs, "latency") == list(timings[:2])
+    assert store.to_run(timings[:2], take.runs, "stale") == []
+    assert store.to_run(timings[:2], take.runs, "all") == list(timings[:2])
+    assert store.to_run(timings[:2], take.runs, "latency") == list(timings[:2])
     change_harness()
-    state = latency_runs.inspect(timings[0], take.runs)
+    state = store.inspect(timings[0], take.runs)
     assert (state.word, state.why) == ("stale", "time: harness changed")
     assert state.row is not None
-    assert latency_runs.to_run(timings[:2], take.runs) == []
-    assert latency_runs.to_run(timings[:2], take.runs, "stale") == list(timings[:2])
+    assert store.to_run(timings[:2], take.runs) == []
+    assert store.to_run(timings[:2], take.runs, "stale") == list(timings[:2])
 
 
 def test_a_time_depends_on_its_engine_and_not_on_training(timings):
     reached = {
         timing.engine: {
             path.relative_to(fingerprint.PACKAGE).as_posix()
-            for path, _ in fingerprint.reach("time", latency_runs.roots(timing))
+            for path, _ in fingerprint.reach("time", jobs.roots(timing))
             if fingerprint.ours(path)
         }
         for timing in timings
     }
-    assert "engines/open_vino.py" in reached["openvino"]
-    assert "engines/open_vino.py" not in reached["plain"]
+    assert "deploy/engines/openvino.py" in reached["openvino"]
+    assert "deploy/engines/openvino.py" not in reached["plain"]
     for files in reached.values():
-        assert {"engines/timed.py", "latency.py", "finish.py", "model/network.py"} <= files
-        assert not files & {"train.py", "evaluate.py", "data/cityscapes.py", "results.py"}
+        assert {"deploy/timer.py", "deploy/maps.py", "core/task.py", "model/network.py"} <= files
+        assert not files & {"train/loop.py", "data/cityscapes.py", "bench/store.py"}
 
 
 def test_an_interruption_stops_the_process_and_leaves_no_row(timings, take):
@@ -410,22 +422,22 @@ def test_an_interruption_stops_the_process_and_leaves_no_row(timings, take):
     assert time.monotonic() - began < 20
     assert words(timings[:2], take.runs) == ["done", "missing"]
     (take.runs / "latency" / "asleep").unlink()
-    assert latency_runs.to_run(timings[:2], take.runs) == [timings[1]]
+    assert store.to_run(timings[:2], take.runs) == [timings[1]]
     take([timings[1]])
     assert words(timings[:2], take.runs) == ["done", "done"]
 
 
 def test_a_second_launcher_is_refused(timings, take):
     with (
-        claim.claim(take.runs / "latency"),
-        pytest.raises(claim.ClaimedError, match=f"process {os.getpid()}"),
+        locks.claim(take.runs / "latency"),
+        pytest.raises(locks.ClaimedError, match=f"process {os.getpid()}"),
     ):
         take(timings[:1])
     assert take.history() == []
 
 
 def test_cells_in_training_hold_still(timings, take):
-    from mtl_bench.core.quiet import Quiet
+    from mtl_bench.core.locks import Quiet
 
     seen = []
 
@@ -455,11 +467,11 @@ def test_cells_in_training_hold_still(timings, take):
 
 
 def test_the_expected_duration_counts_passes_and_pixels(timings, take):
-    assert latency_runs.hours_to_run(timings, timings, take.runs) is None
+    assert store.hours_to_run(timings, timings, take.runs) is None
     take(timings[:1])
-    row = latency_runs.inspect(timings[0], take.runs).row
+    row = store.inspect(timings[0], take.runs).row
     larger = dataclasses.replace(timings[1], size="128x256", passes=1000)
-    hours = latency_runs.hours_to_run([larger], timings, take.runs)
+    hours = store.hours_to_run([larger], timings, take.runs)
     assert hours == pytest.approx(8 * row["seconds"] / 3600)
 
 
@@ -480,7 +492,7 @@ def ablate(tmp_path, write, take, monkeypatch):
         del own["timing"]
         return [sys.executable, str(FAKE), action, str(file), json.dumps(own)]
 
-    monkeypatch.setattr(latency_runs, "timing_command", command)
+    monkeypatch.setattr(jobs, "timing_command", command)
     monkeypatch.setattr(
         engines, "available", lambda name: fake_latency.INSTALL if name == "tensorrt" else None
     )
@@ -548,21 +560,20 @@ def test_options_that_make_no_sense_are_told_in_one_line(ablate, words, message)
 
 
 def test_a_second_launcher_ends_with_one_line(ablate):
-    with claim.claim(ablate.runs / "latency"):
+    with locks.claim(ablate.runs / "latency"):
         assert f"is being run by process {os.getpid()}" in ablate("--quiet", code=75)
         assert f"process {os.getpid()} is timing now" in ablate(command="status")
 
 
 def test_quality_beside_the_speed_is_of_every_seed_that_is_done(monkeypatch, tmp_path):
-    from mtl_bench.cli import latency_grid as commands
-
     def rows(cells, runs):
         return [{"slug": c.slug, "status": "done" if c.seed < 2 else "missing"} for c in cells]
 
-    monkeypatch.setattr(results, "rows", rows)
-    found = commands._quality({"grid": "backbones", "recipe": "small"}, tmp_path)
+    monkeypatch.setattr(store, "rows", rows)
+    grid = load_grid("latency")
+    found = references.quality(grid, tmp_path)
     assert len(found) == 8
-    assert commands._quality({}, tmp_path) == []
+    assert references.quality(dataclasses.replace(grid, quality={}), tmp_path) == []
 
 
 @pytest.mark.slow

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from mtl_bench.bench import claim, launch, results
-from mtl_bench.cli.display import Lines, Running, duration, label
-from mtl_bench.core import provenance
+from mtl_bench.bench import launch, store
+from mtl_bench.bench.jobs import CELLS, load_cell
+from mtl_bench.bench.launch import CellRun, duration
+from mtl_bench.cli.display import Lines
+from mtl_bench.core import locks, provenance
 from mtl_bench.core.config import Cell, Recipe
 
 FAKE = Path(__file__).with_name("fake_cell.py")
@@ -29,7 +31,7 @@ def fake(runs, action="ok", seconds=0.0, actions=None):
     def command(cell):
         code = json.dumps(provenance.code(cell))
         chosen = actions.get(cell.id, actions.get(cell.seed, action))
-        file = results.run_dir(cell, runs) / "cell.json"
+        file = store.run_dir(cell, runs) / "cell.json"
         return [sys.executable, str(FAKE), chosen, str(seconds), code, str(file)]
 
     return command
@@ -60,8 +62,8 @@ def test_runs_each_cell_once_in_order_and_then_nothing(tmp_path):
     assert run(todo, tmp_path) == ["done"] * 3
     starts = [slug for word, slug, *_ in history(tmp_path) if word == "start"]
     assert starts == [cell.slug for cell in todo]
-    assert launch.to_run(todo, tmp_path) == []
-    assert results.load_cell(tmp_path / todo[0].slug / "cell.json") == todo[0]
+    assert store.to_run(todo, tmp_path) == []
+    assert load_cell(tmp_path / todo[0].slug / "cell.json") == todo[0]
     assert not (tmp_path / todo[0].slug / "claim").exists()
 
 
@@ -69,13 +71,13 @@ def test_a_failure_costs_one_cell_and_is_tried_again(tmp_path, capsys):
     todo = cells(4)
     actions = {0: "fail", 1: "crash", 2: "silent"}
     assert run(todo, tmp_path, actions=actions) == ["failed", "failed", "failed", "done"]
-    why = [results.inspect(cell, tmp_path).why for cell in todo]
+    why = [store.inspect(cell, tmp_path).why for cell in todo]
     assert why[0] == "ValueError: on purpose"
     assert why[1].startswith("killed by SIGKILL (out of memory?")
     assert why[1].endswith("about to crash")
     assert why[2] == "ended without a row"
     assert capsys.readouterr().out.count("FAILED") == 3  # quiet or not
-    assert launch.to_run(todo, tmp_path) == todo[:3]
+    assert store.to_run(todo, tmp_path) == todo[:3]
     assert run(todo[:3], tmp_path) == ["done"] * 3
     assert not (tmp_path / todo[0].slug / "failed.json").exists()
 
@@ -102,11 +104,11 @@ def test_stale_rows_are_kept_until_asked_for(tmp_path, change_harness):
     todo = cells(2)
     run(todo, tmp_path)
     change_harness()
-    assert launch.to_run(todo, tmp_path) == []
-    assert "stale 2 (train, evaluate, time: harness changed; --rerun stale)" in launch.summary(
-        todo, tmp_path
+    assert store.to_run(todo, tmp_path) == []
+    assert "stale 2 (train, evaluate, time: harness changed; --rerun stale)" in store.summary(
+        CELLS, todo, tmp_path
     )
-    again = launch.to_run(todo, tmp_path, "stale")
+    again = store.to_run(todo, tmp_path, "stale")
     assert again == todo
     (tmp_path / todo[0].slug / "last.pt").write_text("of the old code")
     assert run(again, tmp_path, rerun="stale") == ["done"] * 2
@@ -121,8 +123,8 @@ def test_rerun_all_and_failed_begin_at_step_0(tmp_path):
     run(todo, tmp_path, actions={1: "fail"})
     for cell in todo:
         (tmp_path / cell.slug / "last.pt").write_text("state")
-    assert launch.to_run(todo, tmp_path, "all") == todo
-    assert launch.to_run(todo, tmp_path) == launch.to_run(todo, tmp_path, "failed") == todo[1:]
+    assert store.to_run(todo, tmp_path, "all") == todo
+    assert store.to_run(todo, tmp_path) == store.to_run(todo, tmp_path, "failed") == todo[1:]
     run(todo[1:], tmp_path, actions={1: "fail"})
     assert (tmp_path / todo[1].slug / "last.pt").exists()
     run(todo[1:], tmp_path, rerun="failed")
@@ -148,7 +150,7 @@ def test_two_launchers_share_a_grid(tmp_path):
 
 def hold(directory, pid):
     directory.mkdir(parents=True, exist_ok=True)
-    owner = {"pid": pid, "machine": claim._machine()}
+    owner = {"pid": pid, "machine": locks._machine()}
     (directory / "claim").write_text(json.dumps(owner))
 
 
@@ -158,7 +160,7 @@ def test_a_cell_that_another_process_runs_is_waited_for(tmp_path, action, word):
     directory = tmp_path / cell.slug
     directory.mkdir()
     other = subprocess.Popen(fake(tmp_path, action, 0.6)(cell))
-    wait_for(lambda: claim.claimed_by(directory) is not None)
+    wait_for(lambda: locks.claimed_by(directory) is not None)
     assert run(todo, tmp_path) == [word]
     other.wait()
     assert [w for w, *_ in history(tmp_path) if w == "start"] == ["start"]
@@ -186,7 +188,7 @@ def video():
 def test_parents_are_run_before_their_children_each_once(tmp_path):
     plain = Cell(Recipe(), "tiny", "fixed")
     own = [replace(plain, single_task=True), plain, replace(plain, video=True)]
-    todo = launch.to_run(own, tmp_path)
+    todo = store.to_run(own, tmp_path)
     assert [cell.tasks for cell in todo[:2]] == [("panoptic",), ("depth",)]
     assert todo[2:] == own
     assert run(todo, tmp_path, jobs=2, seconds=0.3) == ["done"] * 5
@@ -210,9 +212,9 @@ def test_what_a_done_cell_needed_is_not_run_again(tmp_path, video):
     parent, child = video
     run(video, tmp_path)
     (tmp_path / parent.slug / "row.json").unlink()
-    assert launch.to_run([child], tmp_path) == []
-    assert launch.to_run([child], tmp_path, "all") == video
-    assert launch.to_run(video, tmp_path) == [parent]
+    assert store.to_run([child], tmp_path) == []
+    assert store.to_run([child], tmp_path, "all") == video
+    assert store.to_run(video, tmp_path) == [parent]
 
 
 def test_a_failed_parent_leaves_its_child_missing(tmp_path, video, capsys):
@@ -223,7 +225,7 @@ def test_a_failed_parent_leaves_its_child_missing(tmp_path, video, capsys):
     line = f"NOT RUN  needs {parent.slug}, which is failed (ValueError: on purpose)"
     assert line in capsys.readouterr().out  # quiet or not
     assert not (tmp_path / child.slug).exists()
-    assert launch.to_run([child], tmp_path) == video
+    assert store.to_run([child], tmp_path) == video
     assert run(video, tmp_path) == ["done", "done"]
 
 
@@ -231,12 +233,12 @@ def test_a_stale_parent_is_not_used(tmp_path, video, change_harness, capsys):
     parent, child = video
     run([parent], tmp_path)
     change_harness()
-    assert launch.to_run([child], tmp_path) == [child]
+    assert store.to_run([child], tmp_path) == [child]
     assert run([child], tmp_path) == ["missing"]
     why = "train, evaluate, time: harness changed"
     line = f"needs {parent.slug}, which is stale ({why}; --rerun stale)"
     assert line in capsys.readouterr().out
-    assert launch.to_run([child], tmp_path, "stale") == video
+    assert store.to_run([child], tmp_path, "stale") == video
     assert run(video, tmp_path, rerun="stale") == ["done", "done"]
 
 
@@ -246,7 +248,7 @@ def test_a_parent_that_another_process_runs_is_waited_for(tmp_path, video, actio
     directory = tmp_path / parent.slug
     directory.mkdir()
     other = subprocess.Popen(fake(tmp_path, action, 0.8)(parent))
-    wait_for(lambda: claim.claimed_by(directory) is not None)
+    wait_for(lambda: locks.claimed_by(directory) is not None)
     assert run([child], tmp_path) == words
     other.wait()
     starts = [slug for word, slug, *_ in history(tmp_path) if word == "start"]
@@ -291,9 +293,9 @@ def test_interruption_reaches_the_cells_and_waits_for_them(launcher, tmp_path, n
     assert sorted(word for word, *_ in history(tmp_path)) == ["saved", "saved", "start", "start"]
     assert list(tmp_path.glob("*/claim")) == []
     assert list(tmp_path.glob("*/failed.json")) == []
-    words = [results.status(cell, tmp_path) for cell in cells(3)]
+    words = [store.status(cell, tmp_path) for cell in cells(3)]
     assert words == ["interrupted", "interrupted", "missing"]
-    assert launch.to_run(cells(3), tmp_path) == cells(3)
+    assert store.to_run(cells(3), tmp_path) == cells(3)
 
 
 def test_cells_end_with_a_launcher_that_was_killed(launcher, tmp_path):
@@ -301,21 +303,21 @@ def test_cells_end_with_a_launcher_that_was_killed(launcher, tmp_path):
     launcher.wait()
     wait_for(lambda: [w for w, *_ in history(tmp_path)].count("saved") == 2)
     wait_for(lambda: not list(tmp_path.glob("*/claim")))
-    assert [results.status(cell, tmp_path) for cell in cells(2)] == ["interrupted"] * 2
+    assert [store.status(cell, tmp_path) for cell in cells(2)] == ["interrupted"] * 2
 
 
 def test_any_process_ends_with_a_launcher_that_was_killed(tmp_path):
     timing = (
-        "import pathlib, os, time\nfrom mtl_bench import claim\nclaim.end_with_launcher()\n"
+        "import pathlib, os, time\nfrom mtl_bench.core import locks\nlocks.end_with_launcher()\n"
         f"pathlib.Path({str(tmp_path / 'pid')!r}).write_text(str(os.getpid()))\ntime.sleep(60)"
     )
     code = (
-        "import subprocess, sys\nfrom mtl_bench import launch\n"
+        "import subprocess, sys\nfrom mtl_bench.bench import launch\n"
         f"subprocess.run([sys.executable, '-c', {timing!r}], env=launch.child_environment(1))"
     )
     process = subprocess.Popen([sys.executable, "-c", code])
     wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
-    time.sleep(2 * claim.POLL_S)
+    time.sleep(2 * locks.POLL_S)
     assert process.poll() is None  # while the launcher lives, so does it
     process.kill()
     process.wait()
@@ -334,7 +336,7 @@ def test_an_interrupted_cell_is_no_failure(tmp_path):
     os.kill(json.loads((tmp_path / cell.slug / "claim").read_text())["pid"], signal.SIGTERM)
     thread.join()
     assert found[cell.id].word == "interrupted"
-    assert results.status(cell, tmp_path) == "interrupted"
+    assert store.status(cell, tmp_path) == "interrupted"
 
 
 # --- what is shown --------------------------------------------------------------------------------
@@ -369,7 +371,7 @@ def test_bars_show_running_and_ended_cells(tmp_path, monkeypatch):
 def test_time_left_is_from_the_pace_in_this_stage(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    job = Running(1, 2, cells(1)[0], Path("x"))
+    job = CellRun(1, 2, cells(1)[0], Path("x"), command=list)
     assert job.text == "starting"
     job.see({"stage": "train", "step": 50, "steps": 100, "note": "loss 2"})  # resumed
     assert job.left_s is None
@@ -384,21 +386,21 @@ def test_time_left_is_from_the_pace_in_this_stage(monkeypatch):
 def test_labels_tell_cells_apart():
     plain = Cell(Recipe(), "net", "way")
     other = Cell(Recipe(), "net", "way", ("panoptic",), 2, True, method_args={"init": 0.5})
-    assert label(plain) == "way net s0"
-    assert label(other) == "way net s2 panoptic video init=0.5"
+    assert plain.label == "way net s0"
+    assert other.label == "way net s2 panoptic video init=0.5"
     apart = Cell(Recipe(), "net", "way", single_task=True, granularity="tasks")
-    assert label(apart) == "way net s0 single-task by tasks"
+    assert apart.label == "way net s0 single-task by tasks"
 
 
 def test_durations_and_headlines():
     assert [duration(s) for s in (12.4, 59.6, 250, 10950)] == ["12s", "1m00", "4m10", "3h02"]
-    assert results.headline({"panoptic.pq": 34.1}) == "PQ 34.1"
-    assert results.headline({}) == ""
+    assert CELLS.headline({"panoptic.pq": 34.1}) == "PQ 34.1"
+    assert CELLS.headline({}) == ""
 
 
 def test_expected_hours_come_from_the_cells_that_are_done(tmp_path):
     todo = cells(3)
-    assert launch.hours_to_run(todo, todo, tmp_path) is None
+    assert store.hours_to_run(todo, todo, tmp_path) is None
     run(todo[:1], tmp_path)  # the stand-in claims one hour
     apart = replace(todo[0], single_task=True)  # nothing is trained for it but its parents
-    assert launch.hours_to_run([*todo[1:], apart], todo, tmp_path) == pytest.approx(2.0)
+    assert store.hours_to_run([*todo[1:], apart], todo, tmp_path) == pytest.approx(2.0)

@@ -11,11 +11,13 @@ from typing import Any
 
 import pytest
 import torch
+from support.methods import step_of, weights
+from support.terms import TERMS, WHOLE_TASKS
 from torch import Tensor, nn
 
 from mtl_bench.core import plugins
-from mtl_bench.core.config import TASKS
-from mtl_bench.core.terms import Term, terms_of
+from mtl_bench.core.method import Step
+from mtl_bench.core.terms import Term
 
 NAMES = (
     *("fixed", "uncertainty", "fixed_uncertainty", "uncertainty_revised", "uncertainty_soft"),
@@ -106,14 +108,12 @@ def regressions(size: int) -> tuple[Term, ...]:
     return tuple(Term(f"loss{k}", "depth", "regression", 0.5 + k) for k in range(size))
 
 
-def make(name: str, terms: tuple[Term, ...] = terms_of(TASKS), **settings: Any) -> Any:
+def make(name: str, terms: tuple[Term, ...] = TERMS, **settings: Any) -> Any:
     return plugins.load("methods", name)(terms, **settings)
 
 
-def weights(method: Any, loss_K: Tensor) -> Tensor:
-    leaf_K = loss_K.clone().requires_grad_()
-    (weight_K,) = torch.autograd.grad(method.total(leaf_K), leaf_K)
-    return weight_K
+def total(method: Any, loss_K: Tensor, present: Tensor | None = None) -> Tensor:
+    return method.total(step_of(loss_K, present))
 
 
 class Theirs:
@@ -126,7 +126,8 @@ class Theirs:
         self.fixed_K = torch.tensor([term.fixed_weight for term in terms])
         self.past: list[Tensor] = []
 
-    def total(self, loss_K: Tensor) -> Tensor:
+    def total(self, step: Step) -> Tensor:
+        loss_K = step.loss_K
         self.past.append(loss_K.detach())
         if self.name == "STCH" and len(self.past) <= WARMUP:
             return loss_K.log().sum()
@@ -161,7 +162,7 @@ def test_weights_are_torchjds(pair, losses):
         torch.testing.assert_close(found_K, expected_K, rtol=1e-6, atol=0)
         if ours.reevaluates:
             after_K = now_K * (1 - 0.3 * slope_K / 2)
-            ours.after_step(now_K, after_K)
+            ours.after_step(step_of(now_K), after_K)
             theirs.after_step(after_K)
 
 
@@ -180,7 +181,7 @@ def train(method: Any, after_step: Callable[[Tensor, Tensor], None], own: Any, d
     for _ in range(20):
         before_K = losses()
         optimizer.zero_grad()
-        method.total(before_K).backward()
+        total(method, before_K).backward()
         optimizer.step()
         after_step(before_K.detach(), losses().detach())
     return torch.cat([p.detach().flatten() for p in (*net.parameters(), *own)])
@@ -194,7 +195,7 @@ def test_trajectory_of_a_network_is_torchjds(pair):
 
     def hook(before_K: Tensor, after_K: Tensor) -> None:
         if ours.reevaluates:
-            ours.after_step(before_K, after_K)
+            ours.after_step(step_of(before_K), after_K)
 
     own = [p for p in theirs.scalarizer.parameters() if pair[1] != "FAMO"]
     expected = train(theirs, lambda _, after_K: theirs.after_step(after_K), own, convention.dtype)
@@ -210,7 +211,7 @@ def test_trajectory_of_a_network_is_torchjds(pair):
 def test_answers_in_the_losses_type(name, dtype):
     method, loss_K = make(name).to(dtype), torch.tensor([0.3, 2.0, 0.5, 7.0, 1.0], dtype=dtype)
     weight_K = weights(method, loss_K)
-    assert weight_K.dtype == method.total(loss_K).dtype == dtype
+    assert weight_K.dtype == total(method, loss_K).dtype == dtype
     assert (weight_K > 0).all()
     if name != "rlw":
         in_double_K = weights(make(name).to(F64), loss_K.to(F64))
@@ -227,7 +228,7 @@ def test_a_full_batch_gives_what_it_gave_before_losses_could_be_missing(name):
     scale_T = tau_T * method.fixed_T if name == "fixed_uncertainty" else tau_T
     s_T = method.log_variance_T.detach().clone().requires_grad_()
     expected = (scale_T * torch.exp(-s_T) * loss_T + 0.5 * s_T).sum()
-    found = method.total(loss_T)
+    found = total(method, loss_T)
     assert torch.equal(found, expected)
     found.backward(), expected.backward()
     assert torch.equal(method.log_variance_T.grad, s_T.grad)
@@ -240,9 +241,9 @@ def test_revised_uncertainty():
         method.log_variance_T.copy_(s_T)
     tau_T = torch.tensor([1.0, 0.5, 0.5, 0.5, 0.5], dtype=F64)
     expected = (tau_T * torch.exp(-s_T) * loss_T + torch.log1p(torch.exp(s_T))).sum()
-    torch.testing.assert_close(method.total(loss_T), expected)
+    torch.testing.assert_close(total(method, loss_T), expected)
     torch.testing.assert_close(weights(method, loss_T), tau_T * torch.exp(-s_T))
-    assert make("uncertainty_revised").total(torch.full((5,), 1e-6)) > 0
+    assert total(make("uncertainty_revised"), torch.full((5,), 1e-6)) > 0
 
 
 def test_soft_uncertainty():
@@ -259,8 +260,10 @@ def test_fixed_weights_by_name():
     changed = {"center": 100, "panoptic": 3.0}  # a task's, which this cell does not weigh
     found_T = weights(make("fixed", weights=changed), loss_T)
     torch.testing.assert_close(found_T, torch.tensor([1.0, 100.0, 0.01, 1.0, 0.001]))
-    tasks = terms_of(TASKS, "tasks")
-    assert weights(make("fixed", tasks, weights={"depth": 0.5}), loss_T[:2]).tolist() == [1, 0.5]
+    assert weights(make("fixed", WHOLE_TASKS, weights={"depth": 0.5}), loss_T[:2]).tolist() == [
+        1,
+        0.5,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -303,10 +306,8 @@ def test_stch_warms_up_on_logarithms_and_then_looks_at_the_worst():
 
 def test_stch_has_a_warm_up_for_a_loss_that_first_comes_later():
     method, loss_K = make("stch", regressions(3), warmup=2).to(F64), torch.ones(3, dtype=F64)
-    method.present = torch.tensor([0, 1])
     for _ in range(3):
-        method.total(loss_K[:2])
-    method.present = torch.arange(3)
+        total(method, loss_K[:2], torch.tensor([0, 1]))
     late_K = torch.tensor([1.0, 1.0, 4.0], dtype=F64)
     for _ in range(2):
         torch.testing.assert_close(weights(method, late_K), torch.tensor([1, 1, 0.25], dtype=F64))
@@ -318,7 +319,7 @@ def test_famo_turns_to_what_fell_least():
     method, loss_K = make("famo", regressions(2)), torch.tensor([1.0, 1.0])
     assert method.reevaluates
     for _ in range(10):
-        method.after_step(loss_K, torch.tensor([0.5, 0.9]))
+        method.after_step(step_of(loss_K), torch.tensor([0.5, 0.9]))
     share_K = weights(method, loss_K)
     assert share_K[1] > share_K[0] + 0.1
     assert share_K.sum().item() == pytest.approx(1, abs=1e-6)
@@ -389,7 +390,7 @@ def test_learned_scales_at_their_optimum_are_the_logarithm():
         (parameter,) = method.parameters()
         parameter.data = optimum_K
         torch.testing.assert_close(weights(method, loss_K), factor * logarithm_K)
-        method.total(loss_K).backward()
+        total(method, loss_K).backward()
         torch.testing.assert_close(parameter.grad, torch.zeros(3, dtype=F64))
 
 
@@ -402,7 +403,7 @@ def test_limits_of_the_temperatures():
     torch.testing.assert_close(soft[1e-3], one_K[0])
     for mu, expected_K in {1e9: 1 / loss_K, 1e-3: 3 * one_K[2] / loss_K}.items():
         method = make("stch", terms, mu=mu, warmup=1).to(F64)
-        method.total(torch.ones(3, dtype=F64))
+        total(method, torch.ones(3, dtype=F64))
         torch.testing.assert_close(weights(method, loss_K), expected_K)
 
 
@@ -415,8 +416,8 @@ def test_units_of_the_losses_do_not_matter(name):
         mine_T, scaled_T = weights(first, loss_T), weights(second, unit_T * loss_T) * unit_T
         torch.testing.assert_close(direction(scaled_T), direction(mine_T))
         if first.reevaluates:
-            first.after_step(loss_T, loss_T * fall_T)
-            second.after_step(unit_T * loss_T, unit_T * loss_T * fall_T)
+            first.after_step(step_of(loss_T), loss_T * fall_T)
+            second.after_step(step_of(unit_T * loss_T), unit_T * loss_T * fall_T)
 
 
 def test_random_weights_are_equal_on_average():
@@ -429,7 +430,7 @@ def test_random_weights_are_equal_on_average():
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "rlw"])
 def test_the_order_of_the_losses_does_not_matter(name):
     torch.manual_seed(0)
-    terms, order = terms_of(TASKS), [3, 0, 4, 2, 1]
+    terms, order = TERMS, [3, 0, 4, 2, 1]
     first = make(name, terms, **SHORT.get(name, {})).to(F64)
     second = make(name, tuple(terms[i] for i in order), **SHORT.get(name, {})).to(F64)
     for loss_T in torch.rand(8, 5, dtype=F64) + 0.1:
@@ -439,16 +440,16 @@ def test_the_order_of_the_losses_does_not_matter(name):
 # --- state ----------------------------------------------------------------------------------------
 
 
-def step(method: Any, loss_K: Tensor) -> Tensor:
+def step(method: Any, loss_K: Tensor, present: Tensor | None = None) -> Tensor:
     """One step with everything that belongs to it, the method's own parameters by plain descent."""
     leaf_K = loss_K.clone().requires_grad_()
     method.zero_grad()
-    method.total(leaf_K).backward()
+    total(method, leaf_K, present).backward()
     with torch.no_grad():
         for parameter in method.parameters():
             parameter -= 0.1 * parameter.grad
     if method.reevaluates:
-        method.after_step(loss_K, loss_K * (0.5 + loss_K))
+        method.after_step(step_of(loss_K, present), loss_K * (0.5 + loss_K))
     assert leaf_K.grad is not None
     return leaf_K.grad
 
@@ -480,7 +481,7 @@ def per_term(method: Any) -> dict[str, Tensor]:
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "rlw"])
 def test_a_missing_loss_keeps_its_state_and_the_others_go_on_with_theirs(name):
     torch.manual_seed(0)
-    terms, present = terms_of(TASKS), torch.tensor([0, 2, 4])
+    terms, present = TERMS, torch.tensor([0, 2, 4])
     losses = torch.rand(12, 5) + 0.1
     whole = make(name, terms, **SHORT.get(name, {}))
     for loss_T in losses[:5]:
@@ -490,29 +491,28 @@ def test_a_missing_loss_keeps_its_state_and_the_others_go_on_with_theirs(name):
     part.load_state_dict({**part.state_dict(), **state})
     absent = {key: value[[1, 3]].clone() for key, value in per_term(whole).items()}
 
-    whole.present = present
     for loss_T in losses[5:]:
-        torch.testing.assert_close(step(whole, loss_T[present]), step(part, loss_T[present]))
+        found_K = step(whole, loss_T[present], present)
+        torch.testing.assert_close(found_K, step(part, loss_T[present]))
     after = per_term(whole)
     for key, value in per_term(part).items():
         torch.testing.assert_close(after[key][present], value)
         assert torch.equal(after[key][[1, 3]], absent[key])
 
-    whole.present = torch.arange(5)
     assert torch.isfinite(step(whole, losses[0])).all()
 
 
 def test_random_weights_do_not_hang_on_what_is_missing():
     whole, part = make("rlw", seed=1), make("rlw", seed=1)
-    part.present = torch.tensor([0, 3])
+    present = torch.tensor([0, 3])
     for _ in range(3):
-        all_T, two_K = weights(whole, torch.ones(5)), weights(part, torch.ones(2))
+        all_T, two_K = weights(whole, torch.ones(5)), weights(part, torch.ones(2), present)
         torch.testing.assert_close(two_K[0] / two_K[1], all_T[0] / all_T[3])
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_network_alone_is_trained_along_its_loss(name):
-    method = make(name, terms_of(TASKS)[:1], **SHORT.get(name, {}))
+    method = make(name, TERMS[:1], **SHORT.get(name, {}))
     for loss in (2.0, 1.0, 0.5, 0.8, 0.2, 0.1):
         assert step(method, torch.tensor([loss])).item() > 0
 
@@ -533,10 +533,10 @@ HARD = {
 def test_finite_on_hard_losses(name, losses):
     method, ones_T = make(name, **SHORT.get(name, {})), torch.ones(5)
     for loss_T in (*[torch.tensor(losses)] * 5, *[ones_T] * 5, torch.tensor(losses)):
-        assert torch.isfinite(method.total(loss_T))
+        assert torch.isfinite(total(method, loss_T))
         assert torch.isfinite(weights(method, loss_T)).all()
         if method.reevaluates:
-            method.after_step(loss_T, ones_T)
+            method.after_step(step_of(loss_T), ones_T)
     assert all(torch.isfinite(value).all() for value in per_term(method).values())
 
 
@@ -545,7 +545,7 @@ def test_a_loss_below_the_clamp_counts_as_the_clamp(name):
     below, at = torch.tensor([0.0, 1, 1, 1, 1]), torch.tensor([1e-8, 1, 1, 1, 1])
     first, second = (make(name, **SHORT.get(name, {})) for _ in range(2))
     for _ in range(5):
-        torch.testing.assert_close(first.total(below), second.total(at))
+        torch.testing.assert_close(total(first, below), total(second, at))
     assert weights(first, below)[0] == 0
 
 

@@ -23,8 +23,8 @@ class Mine(LossMethod):
         super().__init__(terms, seed)
         self.factor = factor
 
-    def total(self, loss_T):
-        return self.factor * loss_T.sum()
+    def total(self, step):
+        return self.factor * step.loss_K.sum()
 '''
 
 
@@ -323,5 +323,5 @@ def test_columns_are_nothing_but_values(tmp_path, columns):
         tmp_path / "tasks" / "normals.py",
         TASK.partition("    columns")[0] + f"    columns = {columns}\n",
     )
-    with pytest.raises(ValueError, match=r"task 'normals': columns are a tuple of Column"):
+    with pytest.raises(ValueError, match=r"task 'normals': columns are plain values and Column"):
         quality.quality()

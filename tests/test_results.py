@@ -6,9 +6,11 @@ import time
 
 import pytest
 
-from mtl_bench.bench import claim, results
-from mtl_bench.core import plugins, provenance
+from mtl_bench.bench import store
+from mtl_bench.bench.jobs import load_cell
+from mtl_bench.core import locks, plugins, provenance
 from mtl_bench.core.config import Cell, Recipe
+from mtl_bench.core.files import read_json, write_json
 
 METHOD = "from mtl_bench.core.method import LossMethod\n\n\nclass Mine(LossMethod): ...\n"
 CHANGED = METHOD.replace("...", "x = 1")
@@ -26,41 +28,41 @@ def cell(tmp_path, monkeypatch):
 
 @pytest.fixture
 def directory(cell, tmp_path):
-    path = results.run_dir(cell, tmp_path / "runs")
+    path = store.run_dir(cell, tmp_path / "runs")
     path.mkdir(parents=True)
     return path
 
 
 def write_row(directory, cell):
-    results.write_json(
+    write_json(
         directory / "row.json", {"metric": {"panoptic.pq": 0.5}, "code": provenance.code(cell)}
     )
 
 
 def test_write_json_leaves_the_old_file_or_the_new_one(tmp_path):
     path = tmp_path / "value.json"
-    results.write_json(path, {"a": 1})
+    write_json(path, {"a": 1})
     with pytest.raises(TypeError):
-        results.write_json(path, {"a": object()})
-    assert results.read_json(path) == {"a": 1}
+        write_json(path, {"a": object()})
+    assert read_json(path) == {"a": 1}
 
 
 def test_status_follows_what_is_in_the_directory(cell, tmp_path):
     runs = tmp_path / "runs"
-    assert results.status(cell, runs) == "missing"
-    directory = results.run_dir(cell, runs)
+    assert store.status(cell, runs) == "missing"
+    directory = store.run_dir(cell, runs)
     directory.mkdir(parents=True)
-    assert results.status(cell, runs) == "missing"
-    results.begin(cell, runs)
-    assert results.status(cell, runs) == "interrupted"
-    with claim.claim(directory):
-        assert results.status(cell, runs) == "running"
-    results.write_failure(directory, "ValueError: bad", "line\n" * 100, 1)
-    state = results.inspect(cell, runs)
+    assert store.status(cell, runs) == "missing"
+    store.begin(cell, runs)
+    assert store.status(cell, runs) == "interrupted"
+    with locks.claim(directory):
+        assert store.status(cell, runs) == "running"
+    store.write_failure(directory, "ValueError: bad", "line\n" * 100, 1)
+    state = store.inspect(cell, runs)
     assert (state.word, state.why) == ("failed", "ValueError: bad")
-    assert len(results.read_json(directory / "failed.json")["traceback"].splitlines()) == 30
+    assert len(read_json(directory / "failed.json")["traceback"].splitlines()) == 30
     write_row(directory, cell)
-    assert results.status(cell, runs) == "done"
+    assert store.status(cell, runs) == "done"
 
 
 def test_row_is_stale_when_its_code_changed(cell, directory, tmp_path, change_harness):
@@ -68,28 +70,28 @@ def test_row_is_stale_when_its_code_changed(cell, directory, tmp_path, change_ha
     runs = tmp_path / "runs"
     method = tmp_path / "methods" / "mine.py"
     method.write_text(METHOD + "# reworded\n")
-    assert results.status(cell, runs) == "done"
+    assert store.status(cell, runs) == "done"
     method.write_text(CHANGED)
-    state = results.inspect(cell, runs)
+    state = store.inspect(cell, runs)
     assert (state.word, state.why) == ("stale", "train: methods/mine.py changed")
     assert state.row is not None
     assert not state.trained
     method.write_text(METHOD)
-    assert results.status(cell, runs) == "done"
+    assert store.status(cell, runs) == "done"
     change_harness("evaluate", "time")
-    state = results.inspect(cell, runs)
+    state = store.inspect(cell, runs)
     assert (state.why, state.trained) == ("evaluate, time: harness changed", True)
     method.write_text("class Mine(")
-    assert "mine.py: SyntaxError" in results.inspect(cell, runs).why
+    assert "mine.py: SyntaxError" in store.inspect(cell, runs).why
     method.unlink()
-    assert "no method called 'mine'" in results.inspect(cell, runs).why
-    assert not results.inspect(cell, runs).trained
+    assert "no method called 'mine'" in store.inspect(cell, runs).why
+    assert not store.inspect(cell, runs).trained
 
 
 def test_a_row_of_an_older_version_is_stale_and_says_so(cell, directory, tmp_path):
     flat = {"method": "a", "backbone": "b", "harness": "c"}
-    results.write_json(directory / "row.json", {"metric": {}, "code": flat})
-    state = results.inspect(cell, tmp_path / "runs")
+    write_json(directory / "row.json", {"metric": {}, "code": flat})
+    state = store.inspect(cell, tmp_path / "runs")
     assert (state.word, state.why) == ("stale", "stamped by an older version")
     assert not state.trained
 
@@ -97,12 +99,12 @@ def test_a_row_of_an_older_version_is_stale_and_says_so(cell, directory, tmp_pat
 def test_a_composition_is_stale_with_either_of_its_files(cell, directory, tmp_path):
     (tmp_path / "methods" / "other.py").write_text(METHOD)
     both = Cell(Recipe(), "tiny", "mine+other")
-    place = results.run_dir(both, tmp_path / "runs")
+    place = store.run_dir(both, tmp_path / "runs")
     place.mkdir()
     write_row(place, both)
-    assert results.status(both, tmp_path / "runs") == "done"
+    assert store.status(both, tmp_path / "runs") == "done"
     (tmp_path / "methods" / "other.py").write_text(CHANGED)
-    state = results.inspect(both, tmp_path / "runs")
+    state = store.inspect(both, tmp_path / "runs")
     assert (state.word, state.why) == (
         "stale",
         "train: methods/mine.py or methods/other.py changed",
@@ -113,18 +115,18 @@ def test_begin_continues_its_own_checkpoint_and_sets_that_of_other_code_aside(
     cell, tmp_path, change_harness
 ):
     runs = tmp_path / "runs"
-    results.run_dir(cell, runs).mkdir(parents=True)
-    directory, why = results.begin(cell, runs)
+    store.run_dir(cell, runs).mkdir(parents=True)
+    directory, why = store.begin(cell, runs)
     assert why == ""
     (directory / "last.pt").write_text("state")
     (directory / "log.txt").write_text("log")
-    results.write_failure(directory, "out of memory")
-    assert results.begin(cell, runs) == (directory, "")
+    store.write_failure(directory, "out of memory")
+    assert store.begin(cell, runs) == (directory, "")
     assert (directory / "last.pt").exists()
     assert not (directory / "failed.json").exists()
     for number, text in enumerate((CHANGED, METHOD), 1):
         (tmp_path / "methods" / "mine.py").write_text(text)
-        line = results.begin(cell, runs)[1]
+        line = store.begin(cell, runs)[1]
         aside = directory / f"set-aside-{number}"
         assert line == (
             f"starting over (methods/mine.py changed); what there was is kept in {aside}"
@@ -133,12 +135,12 @@ def test_begin_continues_its_own_checkpoint_and_sets_that_of_other_code_aside(
         assert (aside / "last.pt").read_text() == "state"
         assert (directory / "log.txt").exists()
         (directory / "last.pt").write_text("state")
-    results.clear(directory)
+    store.clear(directory)
     assert (directory / "set-aside-1").is_dir()
-    results.begin(cell, runs)
+    store.begin(cell, runs)
     change_harness("evaluate")
     (directory / "last.pt").write_text("state")
-    assert results.begin(cell, runs) == (directory, "")  # training goes on
+    assert store.begin(cell, runs) == (directory, "")  # training goes on
     assert (directory / "last.pt").exists()
 
 
@@ -146,42 +148,42 @@ def test_begin_sets_aside_what_an_older_version_stamped_and_clears_what_was_not_
     cell, directory, tmp_path
 ):
     flat = {"method": "a", "backbone": "b", "harness": "c"}
-    results.write_json(directory / "code.json", flat)
-    assert results.begin(cell, tmp_path / "runs")[1] == ""
+    write_json(directory / "code.json", flat)
+    assert store.begin(cell, tmp_path / "runs")[1] == ""
     assert not list(directory.glob("set-aside-*"))
-    results.write_json(directory / "code.json", flat)
+    write_json(directory / "code.json", flat)
     (directory / "last.pt").write_text("state")
-    assert "stamped by an older version" in results.begin(cell, tmp_path / "runs")[1]
-    assert results.read_json(directory / "set-aside-1" / "code.json") == flat
+    assert "stamped by an older version" in store.begin(cell, tmp_path / "runs")[1]
+    assert read_json(directory / "set-aside-1" / "code.json") == flat
 
 
 def test_cell_file_gives_the_cell_back(cell, tmp_path):
-    results.run_dir(cell, tmp_path).mkdir()
-    directory, _ = results.begin(cell, tmp_path)
-    assert results.load_cell(directory / "cell.json") == cell
+    store.run_dir(cell, tmp_path).mkdir()
+    directory, _ = store.begin(cell, tmp_path)
+    assert load_cell(directory / "cell.json") == cell
     (directory / "cell.json").write_text('{"recipe": {}, "sed": 1}')
     with pytest.raises(ValueError, match=r"cell.json is not a cell: .*did you mean 'seed'"):
-        results.load_cell(directory / "cell.json")
+        load_cell(directory / "cell.json")
     with pytest.raises(ValueError, match="no cell file"):
-        results.load_cell(tmp_path / "gone.json")
+        load_cell(tmp_path / "gone.json")
 
 
 def test_damaged_row_is_an_error_that_names_it(cell, directory, tmp_path):
     (directory / "row.json").write_text('{"metric":')
     with pytest.raises(ValueError, match=r"row.json is damaged"):
-        results.status(cell, tmp_path / "runs")
+        store.status(cell, tmp_path / "runs")
 
 
 def test_rows_of_a_grid_have_todays_status(cell, directory, tmp_path):
     other = Cell(Recipe(), "tiny", "mine", seed=1)
     write_row(directory, cell)
-    first, second = results.rows([cell, other], tmp_path / "runs")
+    first, second = store.rows([cell, other], tmp_path / "runs")
     assert (first["status"], first["metric"]) == ("done", {"panoptic.pq": 0.5})
     assert (second["status"], second["seed"], "metric" in second) == ("missing", 1, False)
     assert second["cell"]["backbone"] == "tiny"
     assert "name" not in first
     names = {cell.id: "First", other.id: "Second"}
-    found = results.rows([cell, other], tmp_path / "runs", names)
+    found = store.rows([cell, other], tmp_path / "runs", names)
     assert [row["name"] for row in found] == ["First", "Second"]
 
 
@@ -189,7 +191,7 @@ def test_rows_of_a_grid_have_todays_status(cell, directory, tmp_path):
 
 
 def write_claim(directory, pid, machine=None, age_s=0.0):
-    owner = {"pid": pid, "machine": machine or claim._machine()}
+    owner = {"pid": pid, "machine": machine or locks._machine()}
     (directory / "claim").write_text(json.dumps(owner))
     os.utime(directory / "claim", (time.time() - age_s,) * 2)
 
@@ -201,29 +203,29 @@ def dead_pid():
 
 
 def test_claim_is_exclusive_and_goes_with_the_block(directory):
-    with claim.claim(directory):
-        assert claim.claimed_by(directory)["pid"] == os.getpid()
-        with pytest.raises(claim.ClaimedError, match=str(os.getpid())), claim.claim(directory):
+    with locks.claim(directory):
+        assert locks.claimed_by(directory)["pid"] == os.getpid()
+        with pytest.raises(locks.ClaimedError, match=str(os.getpid())), locks.claim(directory):
             pass
-        assert claim.claimed_by(directory) is not None
+        assert locks.claimed_by(directory) is not None
     assert not (directory / "claim").exists()
 
 
 def test_claim_of_a_dead_process_is_void_at_once(directory):
     write_claim(directory, dead_pid())
-    assert claim.claimed_by(directory) is None
-    with claim.claim(directory):
-        assert claim.claimed_by(directory)["pid"] == os.getpid()
+    assert locks.claimed_by(directory) is None
+    with locks.claim(directory):
+        assert locks.claimed_by(directory)["pid"] == os.getpid()
     assert list(directory.iterdir()) == []
 
 
 def test_claim_of_a_killed_process_nobody_waited_for_is_void(directory):
     process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     write_claim(directory, process.pid)
-    assert claim.claimed_by(directory) is not None
+    assert locks.claimed_by(directory) is not None
     process.kill()
     deadline = time.monotonic() + 10
-    while claim.claimed_by(directory) is not None:
+    while locks.claimed_by(directory) is not None:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.wait()
@@ -231,16 +233,16 @@ def test_claim_of_a_killed_process_nobody_waited_for_is_void(directory):
 
 def test_claim_of_another_machine_is_void_ten_minutes_after_it_was_renewed(directory):
     write_claim(directory, 1, "elsewhere", age_s=500)
-    assert claim.claimed_by(directory) is not None
+    assert locks.claimed_by(directory) is not None
     write_claim(directory, 1, "elsewhere", age_s=700)
-    assert claim.claimed_by(directory) is None
+    assert locks.claimed_by(directory) is None
 
 
 def test_half_written_claim_counts_for_a_moment(directory):
     (directory / "claim").write_text("")
-    assert claim.claimed_by(directory) == {}
+    assert locks.claimed_by(directory) == {}
     os.utime(directory / "claim", (time.time() - 60,) * 2)
-    assert claim.claimed_by(directory) is None
+    assert locks.claimed_by(directory) is None
 
 
 # --- provenance -----------------------------------------------------------------------------------

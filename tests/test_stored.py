@@ -13,7 +13,7 @@ from mtl_bench.core.batch import collate
 from mtl_bench.core.config import Cell, Latency, load_recipe
 from mtl_bench.core.device import Engine
 from mtl_bench.core.labels import GROUND
-from mtl_bench.core.quiet import Quiet
+from mtl_bench.core.locks import Quiet
 from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.samples import open_samples
 from mtl_bench.evaluate.walk import predict

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from support.methods import update
 
 from mtl_bench.core import plugins
 from mtl_bench.core.terms import Term
@@ -181,11 +182,10 @@ def both(row: Row, case: str, K: int) -> list[tuple[torch.Tensor, torch.Tensor]]
     loss_K, found = torch.ones(K, dtype=torch.float64), []
     torch.manual_seed(7)  # theirs draws from the global generator
     for J_NKP in sequence(row, case, K):
+        direction_P, _ = update(ours, J_NKP, loss_K.expand(len(J_NKP), K))
         if ours.batches == 1:
-            direction_P, _ = ours.direction(J_NKP[0], loss_K)
             expected_P = oracle(J_NKP[0])
         else:
-            direction_P, _ = ours.direction(J_NKP, loss_K.expand(3, K))
             expected_P = oracle(J_NKP[0] @ J_NKP[1].T) @ J_NKP[2]
         found.append((direction_P, row.factor(K) * expected_P))
     return found

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
-
 from mtl_bench.bench.results import write_json
+
 from mtl_bench.core.config import Optim, to_dict
 from mtl_bench.core.device import Engine, choose_device, seed_for
 from mtl_bench.data.loader import train_batches

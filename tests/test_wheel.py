@@ -41,7 +41,7 @@ def installed(tmp_path_factory) -> Path:
 def test_the_wheel_lists_its_own_plugins_from_anywhere(installed, tmp_path):
     clean = {key: value for key, value in os.environ.items() if not key.startswith("MTL_BENCH")}
     text = call(installed / "bin" / "mtl-bench", "list", cwd=tmp_path, env=clean)
-    for name in ("fixed_uncertainty", "efficientnet_lite0", "small", "backbones"):
+    for name in ("fixed_uncertainty", "efficientnet_lite0", "onnxruntime", "small", "backbones"):
         assert name in text
     where = "import mtl_bench.core.plugins as p; print(p.path_of('methods', 'fixed'))"
     path = call(installed / "bin" / "python", "-c", where, cwd=tmp_path, env=clean).strip()

@@ -1,8 +1,10 @@
-"""Runs cells, each in a process of its own: GPU memory is freed, and a crash costs one cell.
+"""Runs jobs, each in a process of its own: GPU memory is freed, and a crash costs one job.
 
-The command of a cell is always `python -m mtl_bench train runs/X/cell.json ...`, here as in a
-terminal. State is the run directories: a launcher that was killed is simply started again, and two
-launchers on one grid share its cells. A cell that needs others waits until they are done.
+The command of a cell is always `python -m mtl_bench train runs/X/cell.json ...`, that of a timing
+`python -m mtl_bench latency ...`, here as in a terminal. State is what lies in runs/: a launcher
+that was killed is simply started again. Two launchers share the cells of a grid, and a cell that
+needs others waits until they are done. Timings are taken one at a time by one launcher, and cells
+that train in the same runs folder hold still meanwhile. `run_here` runs one cell in this process.
 """
 
 import contextlib
@@ -10,215 +12,361 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
+import traceback
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Protocol
 
-from mtl_bench.bench import claim, results
-from mtl_bench.bench.grid import with_parents
-from mtl_bench.cli.display import Display, Running, duration
-from mtl_bench.core.config import Cell, to_dict
+from mtl_bench.bench import store
+from mtl_bench.bench.jobs import Job, Timing, kind_of, with_parents
+from mtl_bench.bench.jobs import lack as lack_of
+from mtl_bench.bench.store import State
+from mtl_bench.core.config import Cell
+from mtl_bench.core.files import read_json, write_json
+from mtl_bench.core.locks import CLAIMED, LAUNCHER, SIDE_BY_SIDE, Quiet, claim, claimed_by
+from mtl_bench.core.plain import to_dict
 from mtl_bench.core.provenance import cores
-from mtl_bench.core.quiet import SIDE_BY_SIDE
 
-CLAIMED = 75  # exit code of a cell that another process runs
-INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a cell that was told to stop
+INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a job that was told to stop
 POLL_S = 0.2
 GRACE_S = 30.0  # for a cell to save its state after Ctrl-C
 
-Command = Callable[[Cell], Sequence[str]]
+CellCommand = Callable[[Cell], Sequence[str]]
+TimingCommand = Callable[[Timing, Path], Sequence[str]]  # a timing, and the file for its row
 
 
-def to_run(cells: Iterable[Cell], runs: Path, rerun: str | None = None) -> list[Cell]:
-    """The cells without a result, those asked for again, and before them what they need.
+class Display(Protocol):
+    """What the launcher tells; `with` begins and ends the showing."""
 
-    Args:
-        rerun: `stale`: also those whose code changed, each from the first stage on that this
-            concerns. `failed`: those that failed begin at step 0
-            rather than at their checkpoint. `all`: every cell, from step 0. `latency`: of those
-            that are done, only the latency.
-    """
-    again: dict[str, list[str]] = {
-        "stale": ["stale"],
-        "all": [*results.WORDS],
-        "latency": ["done", "stale"],
-    }
-    wanted = {"missing", "interrupted", "failed", "running", *again.get(rerun or "", [])}
-    own = [cell for cell in cells if results.status(cell, runs) in wanted]
-    return [cell for cell in with_parents(own) if results.status(cell, runs) in wanted]
-
-
-def cell_command(cell: Cell, runs: Path, data: Path, options: Sequence[str] = ()) -> list[str]:
-    """What runs a cell, here or in a terminal."""
-    file = results.run_dir(cell, runs) / "cell.json"
-    command = [sys.executable, "-m", "mtl_bench", "train", str(file)]
-    return [*command, "--runs", str(runs), "--data", str(data), *options]
+    def __enter__(self) -> "Display": ...
+    def __exit__(self, *error: object) -> None: ...
+    def say(self, line: str) -> None: ...
+    def started(self, run: "Run") -> None: ...
+    def tick(self, runs: Sequence["Run"]) -> None: ...
+    def ended(self, run: "Run", line: str, ok: bool) -> None: ...
 
 
 @dataclass
-class Job(Running):
-    process: subprocess.Popen[bytes] | None = None
+class Run(ABC):
+    """A job on its way: in the queue, then in a process."""
+
+    number: int  # of total, from 1
+    total: int
+    job: Any
+    runs: Path
+    name: str = ""  # the grid's, where it has names
+    began: float = field(default_factory=time.monotonic)
+    progress: Mapping[str, Any] = field(default_factory=dict)  # of its `progress.json`
+    process: "subprocess.Popen[bytes] | None" = None
+    _stage: tuple[str, int, float] = ("", 0, 0.0)  # name, first step seen, when
+
+    @property
+    def label(self) -> str:
+        name = f" ({self.name})" if self.name else ""
+        return f"[{self.number}/{self.total}] {self.job.label}{name}"
+
+    @property
+    def place(self) -> str:
+        """Where its files are, for a reader."""
+        return ""
+
+    @property
+    def log(self) -> Path:
+        return kind_of(self.job).log_file(self.job, self.runs)
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self.began
+
+    def see(self, progress: Mapping[str, Any]) -> None:
+        self.progress = progress
+        if progress["stage"] != self._stage[0]:
+            self._stage = (progress["stage"], progress["step"], time.monotonic())
+
+    @property
+    def left_s(self) -> float | None:
+        """Time left in this stage at its pace so far."""
+        _, first, since = self._stage
+        done = self.progress.get("step", 0) - first
+        if done <= 0:
+            return None
+        pace = (time.monotonic() - since) / done
+        return float(pace * (self.progress["steps"] - self.progress["step"]))
+
+    @property
+    def text(self) -> str:
+        if not self.progress:
+            return "starting"
+        p = self.progress
+        left = "" if self.left_s is None else f", {duration(self.left_s)} left"
+        return f"{p['stage']} {p['step']}/{p['steps']}{left}  {p.get('note', '')}".rstrip()
+
+    @abstractmethod
+    def settled(self, state: State) -> State | None:
+        """What it has come to without a process, for a reason that needs none; None: start one."""
+
+    @abstractmethod
+    def prepare(self, state: State, rerun: str | None) -> Sequence[str]:
+        """Make its place ready; the command to run."""
+
+    @abstractmethod
+    def ended(self, code: int) -> State:
+        """What its process left, by its exit code."""
+
+    def release(self) -> None:  # noqa: B027
+        """Let go of what `prepare` took."""
+
+
+@dataclass
+class CellRun(Run):
+    command: CellCommand = field(kw_only=True)
+
+    @property
+    def directory(self) -> Path:
+        return store.run_dir(self.job, self.runs)
+
+    @property
+    def place(self) -> str:
+        return str(self.directory)
+
+    def settled(self, state: State) -> State | None:
+        """A parent without a result that may be used keeps a cell from ever running."""
+        for parent in self.job.parents:
+            found = store.inspect(parent, self.runs)
+            if not found.trained:
+                remedy = "; --rerun stale" if found.word == "stale" else ""
+                why = f" ({found.why}{remedy})" if found.why else ""
+                return State("missing", f"needs {parent.slug}, which is {found.word}{why}")
+        return None
+
+    def prepare(self, state: State, rerun: str | None) -> Sequence[str]:
+        timed = rerun == "latency" and state.row is not None
+        if rerun == "all" or rerun == state.word == "failed":
+            store.clear(self.directory)
+        renewed = rerun == state.word == "stale"
+        self.directory.mkdir(parents=True, exist_ok=True)
+        for left_over in ("failed.json", "progress.json"):
+            (self.directory / left_over).unlink(missing_ok=True)
+        write_json(self.directory / "cell.json", to_dict(self.job))
+        return [*self.command(self.job), *["--latency"] * timed, *["--stale"] * renewed]
+
+    def ended(self, code: int) -> State:
+        """One that died without a word gets its failure written for it."""
+        if code in INTERRUPTED:
+            return State("interrupted", f"stopped by a signal (exit code {code})")
+        failure = self.directory / "failed.json"
+        kept = (self.directory / "row.json").is_file()
+        if (code or not kept) and not failure.is_file():
+            log = self.log.read_text(errors="replace")
+            store.write_failure(self.directory, explain_exit(code, log), log, code)
+        if code and kept:  # of a row that was to be renewed
+            return State("failed", str(read_json(failure)["error"]))
+        return store.stored(self.job, self.runs)
+
+
+@dataclass
+class TimingRun(Run):
+    """Whatever becomes of it, it leaves a row; an interrupted one leaves none."""
+
+    command: TimingCommand = field(kw_only=True)
+    lack: Callable[[Timing], str | None] = field(kw_only=True)
+    smoke: bool = field(kw_only=True)
+    _code: Any = None
+    _quiet: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+
+    @property
+    def text(self) -> str:
+        return ""
+
+    @property
+    def written(self) -> Path:
+        return self.runs / f"{self.job.slug}.new"
+
+    def settled(self, state: State) -> State | None:
+        self._code = kind_of(self.job).code(self.job)
+        why = self.lack(self.job)
+        return None if why is None else self._keep({"status": "unavailable", "why": why})
+
+    def prepare(self, state: State, rerun: str | None) -> Sequence[str]:
+        self.written.unlink(missing_ok=True)
+        self.log.unlink(missing_ok=True)
+        claims = (path.parent for path in self.runs.glob("*/claim"))
+        training = [path for path in claims if path != self.written.parent]
+        neighbours = any(claimed_by(path) is not None for path in training)
+        self._quiet.enter_context(Quiet(self.runs).alone(neighbours))
+        return self.command(self.job, self.written)
+
+    def ended(self, code: int) -> State:
+        if code in INTERRUPTED:
+            raise KeyboardInterrupt(f"{self.job.label} was told to stop")
+        row = read_json(self.written)
+        self.written.unlink(missing_ok=True)
+        if row is None:
+            log = self.log.read_text(errors="replace")
+            row = {"status": "failed", "why": explain_exit(code, log)}
+        return self._keep(row)
+
+    def _keep(self, row: dict[str, Any]) -> State:
+        kind = kind_of(self.job)
+        own = {"smoke": self.smoke, "code": self._code, "seconds": self.seconds}
+        file = kind.row_file(self.job, self.runs)
+        write_json(file, {**kind.identity(self.job), **row, "timing": to_dict(self.job), **own})
+        return store.stored(self.job, self.runs)
+
+    def release(self) -> None:
+        self._quiet.close()
 
 
 @dataclass
 class Launcher:
-    """Runs cells in `jobs` processes at a time; `run` returns each one's state afterwards."""
+    """Runs jobs in `jobs` processes at a time; `run` returns each one's state afterwards.
+
+    Args:
+        rerun: as in `store.to_run`.
+        names: id -> what the grid calls it.
+        lack: why a timing cannot be taken on this machine; then no process is started for it.
+        smoke: stands in the rows of timings.
+    """
 
     runs: Path
-    command: Command
+    command: Callable[..., Sequence[str]]  # CellCommand | TimingCommand
     display: Display
     jobs: int = 1
     rerun: str | None = None
-    names: Mapping[str, str] = field(default_factory=dict)  # cell id -> what the grid calls it
-    _running: list[Job] = field(default_factory=list)
-    _unsettled: set[str] = field(default_factory=set)  # ids whose cells have not ended here yet
+    names: Mapping[str, str] = field(default_factory=dict)
+    lack: Callable[[Timing], str | None] = lack_of
+    smoke: bool = False
+    _running: list[Run] = field(default_factory=list)
+    _unsettled: set[str] = field(default_factory=set)  # ids whose jobs have not ended here yet
     _elsewhere: set[str] = field(default_factory=set)  # ids that another process was seen running
-    _states: dict[str, results.State] = field(default_factory=dict)
+    _states: dict[str, State] = field(default_factory=dict)
     _began: float = field(default_factory=time.time)
 
-    def run(self, cells: Sequence[Cell]) -> dict[str, results.State]:
+    def run(self, todo: Sequence[Job]) -> dict[str, State]:
         """Run all; on Ctrl-C the running ones are told to save and stop.
 
         A cell whose parent has no usable result in the end is not run: its state is `missing`.
 
         Raises:
-            KeyboardInterrupt: after they have stopped.
+            ClaimedError: another launcher takes timings in this runs folder.
+            KeyboardInterrupt: after they have stopped; a timing has no row then.
         """
-        queue: deque[Job] = deque()
-        for number, cell in enumerate(cells, 1):
-            directory, name = results.run_dir(cell, self.runs), self.names.get(cell.id, "")
-            queue.append(Job(number, len(cells), cell, directory, name=name))
-        self._unsettled = {cell.id for cell in cells}
-        try:
-            while queue or self._running:
-                self._fill(queue)
-                self._reap(queue)
-                self.display.tick(self._running)
-                time.sleep(POLL_S)
-        except BaseException:
-            self._stop()
-            raise
+        queue = deque(self._queued(job, n, len(todo)) for n, job in enumerate(todo, 1))
+        self._unsettled = {job.id for job in todo}
+        timed = any(isinstance(job, Timing) for job in todo)
+        with claim(self.runs / "latency") if timed else contextlib.nullcontext():
+            try:
+                while queue or self._running:
+                    self._fill(queue)
+                    self._reap(queue)
+                    self.display.tick(self._running)
+                    if self._running or queue:
+                        time.sleep(POLL_S)
+            except BaseException:
+                self._stop()
+                raise
         return self._states
 
-    def _fill(self, queue: deque[Job]) -> None:
-        """Start queued cells in free places; those that must wait keep their place in the queue."""
+    def _queued(self, job: Job, number: int, total: int) -> Run:
+        given = (number, total, job, self.runs, self.names.get(job.id, ""))
+        if isinstance(job, Timing):
+            return TimingRun(*given, command=self.command, lack=self.lack, smoke=self.smoke)
+        return CellRun(*given, command=self.command)
+
+    def _fill(self, queue: deque[Run]) -> None:
+        """Start queued jobs in free places; those that must wait keep their place in the queue."""
         waiting = []
         while queue and len(self._running) < self.jobs:
-            job = queue.popleft()
-            state = results.inspect(job.cell, self.runs)
+            run = queue.popleft()
+            state = store.inspect(run.job, self.runs)
             if state.word == "running":
-                if job.cell.id not in self._elsewhere:
-                    self.display.say(f"{job.label}  is run by another process")
-                self._elsewhere.add(job.cell.id)
-                waiting.append(job)
-            elif self._settled_elsewhere(job, state):
-                self._end(job, state, "by another process")
-            elif self._must_wait(job):
-                waiting.append(job)
-            elif lack := self._lack(job):
-                self._give_up(job, lack)
+                if run.job.id not in self._elsewhere:
+                    self.display.say(f"{run.label}  is run by another process")
+                self._elsewhere.add(run.job.id)
+                waiting.append(run)
+            elif self._settled_elsewhere(run, state):
+                self._end(run, state, "by another process")
+            elif self._must_wait(run):
+                waiting.append(run)
             else:
-                self._start(job, state)
+                self._start(run, state)
         queue.extendleft(reversed(waiting))
 
-    def _must_wait(self, job: Job) -> bool:
+    def _must_wait(self, run: Run) -> bool:
         """Whether a parent is still to run, here or in another process."""
         return any(
-            parent.id in self._unsettled or results.status(parent, self.runs) == "running"
-            for parent in job.cell.parents
+            parent.id in self._unsettled or store.status(parent, self.runs) == "running"
+            for parent in run.job.parents
         )
 
-    def _lack(self, job: Job) -> str:
-        """What keeps a cell from ever running: a parent without a result that may be used."""
-        for parent in job.cell.parents:
-            state = results.inspect(parent, self.runs)
-            if not state.trained:
-                remedy = "; --rerun stale" if state.word == "stale" else ""
-                why = f" ({state.why}{remedy})" if state.why else ""
-                return f"needs {parent.slug}, which is {state.word}{why}"
-        return ""
-
-    def _give_up(self, job: Job, lack: str) -> None:
-        self._unsettled.discard(job.cell.id)
-        self._states[job.cell.id] = results.State("missing", lack)
-        self.display.ended(job, f"{job.label}  NOT RUN  {lack}", False)
-
-    def _settled_elsewhere(self, job: Job, state: results.State) -> bool:
-        """Whether another process brought the cell to an end since this launcher began."""
-        if job.cell.id in self._elsewhere:
+    def _settled_elsewhere(self, run: Run, state: State) -> bool:
+        """Whether another process brought the job to an end since this launcher began."""
+        if run.job.id in self._elsewhere:
             return state.word in ("done", "failed")
-        row = job.directory / "row.json"
+        row = kind_of(run.job).row_file(run.job, self.runs)
         return state.word == "done" and row.stat().st_mtime > self._began
 
-    def _start(self, job: Job, state: results.State) -> None:
-        timed = self.rerun == "latency" and state.row is not None
-        if self.rerun == "all" or self.rerun == state.word == "failed":
-            results.clear(job.directory)
-        renewed = self.rerun == state.word == "stale"
-        job.directory.mkdir(parents=True, exist_ok=True)
-        for left_over in ("failed.json", "progress.json"):
-            (job.directory / left_over).unlink(missing_ok=True)
-        results.write_json(job.directory / "cell.json", to_dict(job.cell))
-        job.began, job.progress = time.monotonic(), {}
-        with (job.directory / "log.txt").open("ab") as log:
-            job.process = subprocess.Popen(
-                [*self.command(job.cell), *["--latency"] * timed, *["--stale"] * renewed],
+    def _start(self, run: Run, state: State) -> None:
+        run.began, run.progress = time.monotonic(), {}
+        settled = run.settled(state)
+        if settled is not None:
+            self._end(run, settled)
+            return
+        command = run.prepare(state, self.rerun)
+        self._running.append(run)
+        with run.log.open("ab") as log:
+            run.process = subprocess.Popen(
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=child_environment(self.jobs),
                 start_new_session=True,  # Ctrl-C reaches it once, through `_stop`
             )
-        self._running.append(job)
-        self.display.started(job)
+        self.display.started(run)
 
-    def _reap(self, queue: deque[Job]) -> None:
-        for job in list(self._running):
-            assert job.process is not None
+    def _reap(self, queue: deque[Run]) -> None:
+        for run in list(self._running):
+            assert run.process is not None
             with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
-                job.see(json.loads((job.directory / "progress.json").read_text()))
-            code = job.process.poll()
+                run.see(json.loads((run.log.parent / "progress.json").read_text()))
+            code = run.process.poll()
             if code is None:
                 continue
-            self._running.remove(job)
+            self._running.remove(run)
+            run.release()
             if code == CLAIMED:  # another launcher was faster
-                self._elsewhere.add(job.cell.id)
-                queue.append(job)
+                self._elsewhere.add(run.job.id)
+                queue.append(run)
             else:
-                self._end(job, self._state_after(job, code))
+                self._end(run, run.ended(code))
 
-    def _state_after(self, job: Job, code: int) -> results.State:
-        """What a process left; one that died without a word gets its failure written for it."""
-        if code in INTERRUPTED:
-            return results.State("interrupted", f"stopped by a signal (exit code {code})")
-        failure = job.directory / "failed.json"
-        kept = (job.directory / "row.json").is_file()
-        if (code or not kept) and not failure.is_file():
-            log = (job.directory / "log.txt").read_text(errors="replace")
-            results.write_failure(job.directory, explain_exit(code, log), log, code)
-        if code and kept:  # of a row that was to be renewed
-            return results.State("failed", str(results.read_json(failure)["error"]))
-        return results.stored(job.cell, self.runs)
-
-    def _end(self, job: Job, state: results.State, how: str = "") -> None:
-        self._unsettled.discard(job.cell.id)
-        self._states[job.cell.id] = state
-        ok = state.word in ("done", "stale")
+    def _end(self, run: Run, state: State, how: str = "") -> None:
+        self._unsettled.discard(run.job.id)
+        self._states[run.job.id] = state
+        ok = state.word in kind_of(run.job).good
+        if state.word == "missing":
+            self.display.ended(run, f"{run.label}  NOT RUN  {state.why}", ok)
+            return
+        about = [state.headline or state.why, run.place]
+        if not ok:
+            about = [state.why, f"log: {run.log}"]
         word = state.word if ok else state.word.upper()
-        about = state.headline if ok else f"{state.why}  log: {job.directory}/log.txt"
-        words = [job.label, f"{word} {how}".strip(), duration(job.seconds), about]
-        self.display.ended(job, "  ".join([*words, str(job.directory)] if ok else words), ok)
+        words = [run.label, f"{word} {how}".strip(), duration(run.seconds), *filter(None, about)]
+        self.display.ended(run, "  ".join(words), ok)
 
     def _stop(self) -> None:
         """Forward the interruption and wait; a second Ctrl-C or half a minute kills."""
-        processes = [job.process for job in self._running if job.process is not None]
+        processes = [run.process for run in self._running if run.process is not None]
         for process in processes:
             process.send_signal(signal.SIGINT)
-        if processes:
-            self.display.say(f"stopping {len(processes)} running cells; they save their state")
+        saving = sum(not isinstance(run.job, Timing) for run in self._running)
+        if saving:
+            self.display.say(f"stopping {saving} running cells; they save their state")
         deadline = time.monotonic() + GRACE_S
         try:
             for process in processes:
@@ -227,11 +375,13 @@ class Launcher:
             for process in processes:
                 process.kill()
                 process.wait()
+        for run in self._running:
+            run.release()
 
 
 def child_environment(jobs: int) -> dict[str, str]:
-    """Of a cell's process; processes side by side share the cores instead of fighting for them."""
-    extra = {claim.LAUNCHER: str(os.getpid()), "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+    """Of a job's process; processes side by side share the cores instead of fighting for them."""
+    extra = {LAUNCHER: str(os.getpid()), "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if jobs > 1:
         extra["OMP_NUM_THREADS"] = str(max(1, cores() // jobs))
         extra[SIDE_BY_SIDE] = str(jobs)
@@ -253,23 +403,89 @@ def explain_exit(code: int, log: str) -> str:
     return f"exit code {code}{last}"
 
 
-def summary(cells: Sequence[Cell], runs: Path) -> str:
-    """`done 3   failed 1`, and what to do about stale and failed ones."""
-    states = [results.inspect(cell, runs) for cell in cells]
-    reasons = "; ".join(sorted({state.why for state in states if state.word == "stale"}))
-    hints = {"stale": f" ({reasons}; --rerun stale)", "failed": " (tried again by the next ablate)"}
-    counts = {word: sum(state.word == word for state in states) for word in results.WORDS}
-    return "   ".join(f"{word} {n}{hints.get(word, '')}" for word, n in counts.items() if n)
+def duration(seconds: float) -> str:
+    """3h02, 4m10, 12s"""
+    whole = round(seconds)
+    if whole >= 3600:
+        return f"{whole // 3600}h{whole % 3600 // 60:02}"
+    return f"{whole // 60}m{whole % 60:02}" if whole >= 60 else f"{whole}s"
 
 
-def hours_to_run(todo: Sequence[Cell], cells: Sequence[Cell], runs: Path) -> float | None:
-    """Expected duration of cells, from the mean of those that are done; None where none is.
+# --- one cell, in this process --------------------------------------------------------------------
 
-    Only cells that train count: a single-task cell's row repeats the times of its parents.
+
+@dataclass(frozen=True)
+class Here:
+    """Runs cells in this process.
+
+    Args:
+        root: the data set.
+        echo: where lines of text go.
     """
-    states = [results.inspect(cell, runs) for cell in cells if not cell.single_task]
-    rows = [state.row for state in states if state.row is not None]
-    times = [[v for k, v in row.get("time", {}).items() if k.endswith("_s")] for row in rows]
-    known = [sum(values) for values in times if values]
-    count = sum(not cell.single_task for cell in todo)
-    return count * sum(known) / len(known) / 3600 if known else None
+
+    runs: Path
+    root: Path
+    device: str
+    wandb: str
+    echo: Callable[[str], None]
+
+    def run(self, cell: Cell, rerun: bool = False, stale: bool = False) -> None:
+        """Run what is left of a cell, after the cells that it needs.
+
+        Args:
+            rerun: from step 0, whatever there is.
+            stale: of a row whose code changed, only what that concerns.
+
+        Raises:
+            ValueError: a cell that it needs is stale.
+            ClaimedError: another process runs one of them.
+        """
+        for parent in with_parents(cell.parents):
+            assert isinstance(parent, Cell)
+            state = store.inspect(parent, self.runs)
+            if state.word == "stale" and not state.trained:
+                again = f"mtl-bench train {store.run_dir(parent, self.runs)}/cell.json --stale"
+                raise ValueError(f"a cell that this one needs is stale, {state.why}: {again}")
+            if not state.trained:
+                self.echo(f"{cell.label} needs {parent.label} first")
+                self._run(parent, rerun=False, stale=False)
+        self._run(cell, rerun, stale)
+
+    def _run(self, cell: Cell, rerun: bool, stale: bool) -> None:
+        directory = store.run_dir(cell, self.runs)
+        with claim(directory):
+            if rerun:
+                store.clear(directory)
+            elif line := store.done_already(cell, self.runs, stale):  # meanwhile, by another
+                self.echo(line)
+                return
+            renewed = stale and store.can_renew(cell, self.runs)
+            if not renewed:
+                self._begin(cell)
+            with _recorded(directory):
+                from mtl_bench.bench.run import renew, run_cell
+
+                if renewed:
+                    renew(cell, directory, self.root, self.device, self.echo)
+                else:
+                    run_cell(cell, directory, self.root, self.device, self.wandb, self.echo)
+        self.echo(f"{directory}/row.json")
+
+    def _begin(self, cell: Cell) -> None:
+        state = store.stored(cell, self.runs)
+        if state.word == "stale":
+            self.echo(store.set_aside(store.run_dir(cell, self.runs), state.why))
+        if line := store.begin(cell, self.runs)[1]:
+            self.echo(line)
+
+
+@contextlib.contextmanager
+def _recorded(directory: Path) -> Iterator[None]:
+    """Whatever ends a run early other than an interruption is left in `failed.json`."""
+    (directory / "failed.json").unlink(missing_ok=True)
+    try:
+        yield
+    except Exception as error:
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+        store.write_failure(directory, line, traceback.format_exc())
+        raise

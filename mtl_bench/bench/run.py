@@ -1,7 +1,6 @@
 """One cell, whole: train, evaluate, time, and the row that says so."""
 
 import json
-import os
 import resource
 import sys
 import time
@@ -13,12 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from mtl_bench.bench import results
+from mtl_bench.bench import store
+from mtl_bench.bench.jobs import CELLS
 from mtl_bench.bench.stored import load_model, time_again, time_cell
 from mtl_bench.core import provenance
-from mtl_bench.core.config import Cell, to_dict
+from mtl_bench.core.config import Cell
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.device import Engine, choose_device
+from mtl_bench.core.files import read_json, replacing, write_json
 from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.samples import open_samples
 from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, open_walks
@@ -51,7 +52,7 @@ def run_cell(
     """Run what is left of a cell and write its row; every stage can be killed and run again.
 
     Args:
-        run_dir: the cell's folder, which exists (see `results.begin`).
+        run_dir: the cell's folder, which exists (see `store.begin`).
         root: the data set.
         echo: where lines of text go.
 
@@ -67,7 +68,7 @@ def run_cell(
     progress.catch_signals()
     tracker = Tracker(wandb, cell, run_dir)
     code, environment = provenance.code(cell), provenance.environment(engine.device)
-    results.write_json(run_dir / "env.json", environment)
+    write_json(run_dir / "env.json", environment)
 
     tasks = tasks_of_cell(cell)
     open_walks(cell.recipe, tasks, root)  # what would stop the evaluation is told at once
@@ -91,7 +92,8 @@ def run_cell(
     echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
 
     row = {
-        **_identity(cell),
+        **CELLS.identity(cell),
+        "status": "done",
         "metric": {**evaluation.metrics, **timing},
         "protocol": {**evaluation.protocol, **_training_protocol(cell, root), **trained.protocol},
         "time": {**took, "eval_s": eval_s, "latency_s": latency_s},
@@ -100,7 +102,7 @@ def run_cell(
     }
     tracker.log({key: value for key, value in row["metric"].items() if not isinstance(value, str)})
     tracker.finish()
-    results.write_json(run_dir / "row.json", row)
+    write_json(run_dir / "row.json", row)
     return row
 
 
@@ -112,9 +114,9 @@ def renew(
     A row that an older version stamped is stamped anew where its checkpoint gives back every metric
     (latency apart), bit for bit. Where it does not, the row is stale for training from then on.
     """
-    row = results.load_row(run_dir)
+    row = store.load_row(run_dir)
     assert row is not None
-    code, stale = provenance.code(cell), results.changed(row["code"], cell)
+    code, stale = provenance.code(cell), store.changed(row["code"], cell)
     older = provenance.STAMPED_BEFORE in stale.values()
     if "evaluate" in stale:
         if cell.single_task:
@@ -129,7 +131,7 @@ def renew(
         if older and json.dumps(before) != json.dumps(after):  # as text: NaN equals itself
             different = sum(json.dumps(before[k]) != json.dumps(after[k]) for k in before)
             row["code"] = {stage: {} for stage in code}
-            results.write_json(run_dir / "row.json", row)
+            write_json(run_dir / "row.json", row)
             echo(
                 f"{different} of {len(before)} metrics differ from those of the row, which stays "
                 f"as it is: stale, to be trained again"
@@ -145,7 +147,7 @@ def renew(
             _save_samples(run_dir / "samples.npz", evaluation.samples)
     again = "time" in stale and not older
     row["code"] = {**code, "time": row["code"]["time"]} if again else code
-    results.write_json(run_dir / "row.json", row)
+    write_json(run_dir / "row.json", row)
     if again:
         time_again(cell, run_dir, root, device, echo)
 
@@ -159,7 +161,7 @@ def _evaluate(
         model, cell, root, engine.device, progress=lambda n, of: progress.update("evaluate", n, of)
     )
     eval_s = time.perf_counter() - start
-    progress.say(f"evaluated in {eval_s:.0f} s: {results.headline(evaluation.metrics)}")
+    progress.say(f"evaluated in {eval_s:.0f} s: {CELLS.headline(evaluation.metrics)}")
     return evaluation, eval_s
 
 
@@ -170,7 +172,7 @@ def _train(
     cell: Cell, run_dir: Path, root: Path, engine: Engine, progress: Progress, tracker: Tracker
 ) -> Trained:
     """Train; a video cell goes on from its parent's checkpoint, with labels that this one made."""
-    taken: dict[str, Any] = results.read_json(run_dir / TAKEN) or {}
+    taken: dict[str, Any] = read_json(run_dir / TAKEN) or {}
     start = further_labels = None
     protocol = {}
     if cell.video:
@@ -182,7 +184,7 @@ def _train(
     given = (cell, root, run_dir, engine, progress, tracker)
     model = train(*given, start=start, further_labels=further_labels)
     taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(engine.device))
-    results.write_json(run_dir / TAKEN, taken)
+    write_json(run_dir / TAKEN, taken)
     train_s, step_ms = training_time(run_dir / "curve.csv")
     waited = {"data_share": data_share(run_dir / "curve.csv")}
     return Trained(model, {"train_s": train_s, "step_ms": step_ms, **waited, **taken}, protocol)
@@ -216,7 +218,7 @@ def _pseudo_labels(
     made = counts[-1] - counts[0]
     if made:  # a run that was killed here made the others, as fast
         taken["pseudo_s"] = (time.perf_counter() - began) * counts[-1] / made
-        results.write_json(run_dir / TAKEN, taken)
+        write_json(run_dir / TAKEN, taken)
         progress.say(f"labelled {made} frames in {taken['pseudo_s']:.0f} s")
     return folder, counts[-1]
 
@@ -235,8 +237,8 @@ def _result_of(parent: Cell, runs: Path) -> tuple[dict[str, Any], Path]:
     Raises:
         ValueError: it lacks one of them, or they are of other code.
     """
-    state = results.stored(parent, runs)
-    path = results.run_dir(parent, runs) / CHECKPOINT
+    state = store.stored(parent, runs)
+    path = store.run_dir(parent, runs) / CHECKPOINT
     if not state.trained or state.row is None or not path.is_file():
         word = "without its checkpoint" if state.trained else state.word
         why = f" ({state.why})" if state.why else ""
@@ -262,31 +264,6 @@ def _training_protocol(cell: Cell, root: Path) -> dict[str, Any]:
     return protocol
 
 
-def _identity(cell: Cell) -> dict[str, Any]:
-    """What a row says of its cell; rows travel, so a weights file goes without its folder."""
-    values = to_dict(cell)
-    if cell.pretrained is not None:
-        values["pretrained"] = Path(cell.pretrained).name
-    return {
-        "cell_id": cell.id,
-        "slug": cell.slug,
-        "status": "done",
-        "method": cell.method,
-        "backbone": cell.backbone,
-        "tasks": list(cell.tasks),
-        "seed": cell.seed,
-        "video": cell.video,
-        "single_task": cell.single_task,
-        "granularity": cell.granularity,
-        "pretrained": values["pretrained"],
-        "recipe": cell.recipe.name,
-        "smoke": cell.recipe.smoke,
-        "cell": values,
-    }
-
-
 def _save_samples(path: Path, samples: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
+    with replacing(path) as file:
         np.savez_compressed(file, **samples)
-    temporary.replace(path)

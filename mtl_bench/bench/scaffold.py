@@ -15,12 +15,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from mtl_bench.core.method import LossMethod, Step
 from mtl_bench.core.terms import Term
-from mtl_bench.core.method import LossMethod
 
 
-# For a method that needs the gradient of every loss, derive from GradientMethod (of the same
-# module) and write weights(G_KK, loss_K) or direction(J_KP, loss_K) in place of total.
+# A method that needs the gradient of every loss derives from GradientMethod (of the same module)
+# and writes weights(G_KK, step) in place of total. With needs = "representation" the gradients are
+# those of what the decoders read; with needs = "jacobian" it writes direction(J_KP, step).
 class {title}(LossMethod):
     """sum_i exp(-s_i) w_i L_i + s_i / 2, with w the fixed weights and s learned
 
@@ -33,11 +34,11 @@ class {title}(LossMethod):
         # State that training changes is a parameter (learned) or a buffer: both are checkpointed.
         self.s_T = nn.Parameter(torch.full((len(terms),), init))
 
-    def total(self, loss_K: Tensor) -> Tensor:
+    def total(self, step: Step) -> Tensor:
         """Unweighted losses, in the order of self.terms -> the scalar to minimise."""
-        here = self.present  # which K of the T losses: a batch may lack a task's labels
+        here = step.present  # which K of the T losses: a batch may lack a task's labels
         s_K, fixed_K = self.s_T[here], self.fixed_T[here]
-        return (torch.exp(-s_K) * fixed_K * loss_K + 0.5 * s_K).sum()
+        return (torch.exp(-s_K) * fixed_K * step.loss_K + 0.5 * s_K).sum()
 '''
 
 BACKBONE = '''"""{title}: one line that `mtl-bench list` shows; parameters, licence of the weights.
@@ -89,11 +90,39 @@ class {title}(Backbone):
         return {{stride: found[stride] for stride in self.channels}}
 '''
 
-TEMPLATES = {"methods": METHOD, "backbones": BACKBONE}
+ENGINE = '''"""{title}: one line that `mtl-bench list` shows.
+
+Source: the package that it runs. Then what has to be known about it.
+"""
+
+from torch import Tensor, nn
+
+from mtl_bench.core.engine import Setting
+from mtl_bench.deploy.graph import GraphEngine, strided
+
+
+# For an engine that reads ONNX files, mtl_bench.deploy.export.strided_file writes one.
+class {title}(GraphEngine):
+    """The graph, run by torch."""
+
+    precisions = {{"cpu": ("fp32",), "cuda": ("fp32",)}}  # by kind of device: fp32, bf16, fp16
+    # packages = ("mine",)  # that `build` imports, where it is more than torch
+    # extra = ("mine>=1.0",)  # what to pip install where they are missing
+
+    def build(self, net: nn.Module, setting: Setting) -> None:
+        """Prepare everything for images of this size, in this precision, on this device."""
+        self.graph = strided(net, (setting.batch, *setting.size), setting.dtype)
+
+    def strided(self, image: Tensor) -> dict[str, Tensor]:
+        """Image uint8 [B,H,W,3] -> the graph's maps at its finest stride, float32, by name."""
+        return dict(zip(self.graph.names, self.graph(image), strict=True))
+'''
+
+TEMPLATES = {"methods": METHOD, "backbones": BACKBONE, "engines": ENGINE}
 
 
 def write(kind: str, name: str, folder: Path | None = None) -> Path:
-    """Write the scaffold of a plug-in, into `./methods` or `./backbones` unless told otherwise.
+    """Write the scaffold of a plug-in, into `./methods` (`./backbones`, `./engines`) unless told.
 
     Raises:
         ValueError: an impossible or taken name.

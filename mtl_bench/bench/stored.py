@@ -8,17 +8,19 @@ from typing import Any
 
 import torch
 
-from mtl_bench.bench import results
+from mtl_bench.bench import store
+from mtl_bench.bench.jobs import load_run
 from mtl_bench.core import provenance
 from mtl_bench.core.batch import collate
 from mtl_bench.core.config import Cell
 from mtl_bench.core.device import Engine, choose_device
-from mtl_bench.core.quiet import SIDE_BY_SIDE, Quiet
+from mtl_bench.core.files import write_json
+from mtl_bench.core.locks import SIDE_BY_SIDE, Quiet
 from mtl_bench.core.task import Results
 from mtl_bench.data.loader import eval_batches
 from mtl_bench.data.samples import open_samples
+from mtl_bench.deploy.timer import measure
 from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, predict, true_size
-from mtl_bench.latency import measure
 from mtl_bench.model import Model, side_by_side
 from mtl_bench.train import checkpoint
 from mtl_bench.train.loop import CHECKPOINT, build
@@ -93,6 +95,25 @@ def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
     return model
 
 
+def deployed(path: Path, tasks: tuple[str, ...] | None) -> tuple[Cell, Model]:
+    """A trained cell and its model, as it is deployed.
+
+    Args:
+        path: a run's folder, or its checkpoint.
+        tasks: leave only these; None: all that it was trained for.
+
+    Raises:
+        ValueError: no checkpoint there, or it has not been trained for a task.
+    """
+    cell, weights = load_run(path)
+    model = load_model(cell, weights, Engine(torch.device("cpu")))
+    lacking = [task for task in tasks or () if task not in cell.tasks]
+    if lacking:
+        raise ValueError(f"{path} is trained for {', '.join(cell.tasks)}, not for {lacking[0]}")
+    model.keep(tasks or cell.tasks)
+    return cell, model
+
+
 def time_cell(
     model: Model, cell: Cell, root: Path, engine: Engine, quiet: Quiet
 ) -> tuple[dict[str, Any], float]:
@@ -128,7 +149,7 @@ def time_again(
 ) -> None:
     """Replace the latency of a finished cell's row: for one that was taken on a busy machine."""
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
-    code, row = provenance.code(cell)["time"], results.load_row(run_dir)
+    code, row = provenance.code(cell)["time"], store.load_row(run_dir)
     assert row is not None
     model = load_model(cell, run_dir / CHECKPOINT, engine)
     timing, latency_s = time_cell(model, cell, root, engine, Quiet(run_dir.parent))
@@ -137,5 +158,5 @@ def time_again(
     if "time" in row["code"]:  # not so in a row that an older version stamped
         row["code"]["time"] = code
     row["env_of_latency"] = provenance.environment(engine.device)
-    results.write_json(run_dir / "row.json", row)
+    write_json(run_dir / "row.json", row)
     echo(f"timed again in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")

@@ -1,7 +1,8 @@
 """The command line: what the commands are, and what an error, an interruption or a bug becomes.
 
-Exit codes: 0 done, 1 some cell failed, 2 wrong usage or bad input (one line says what), 130
-interrupted. Commands import what they need inside, so that help and lists come at once.
+Exit codes: 0 done, 1 some cell failed, 2 wrong usage or bad input (one line says what), 75
+another process is at it, 130 interrupted. Commands import what they need inside, so that help and
+lists come at once.
 """
 
 import errno
@@ -16,6 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from mtl_bench.cli import cell, data, deploy, figure, grid, look, predict, pseudo
+from mtl_bench.core.locks import CLAIMED, ClaimedError
 
 TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # no space, over quota, read-only
@@ -31,6 +33,9 @@ class Group(TyperGroup):
         except KeyboardInterrupt as stop:
             typer.echo(f"interrupted{f': {stop}' if str(stop) else ''}", err=True)
             raise typer.Exit(130) from None
+        except ClaimedError as error:
+            typer.echo(f"mtl-bench: {error}", err=True)
+            raise typer.Exit(CLAIMED) from None
         except (ValueError, OSError) as error:
             if isinstance(error, OSError) and not _is_users(error):
                 raise

@@ -76,13 +76,9 @@ def _sources(cell: Cell, root: Path, out: Path | None) -> tuple["FrameCache", li
 def _build(frames: "FrameCache", sources: list["Source"], quiet: bool) -> None:
     if not sources:
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
     from mtl_bench.data import frame_cache
 
-    columns = ("decoding frames", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
+    with o.bar("decoding frames", quiet) as bar:
         task = bar.add_task("", total=len(sources))
         for done in frame_cache.build(frames, sources):
             bar.update(task, completed=done)

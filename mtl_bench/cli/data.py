@@ -1,6 +1,5 @@
 """`data synthetic` and `data check`; `data cache` has a file of its own."""
 
-import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -43,10 +42,7 @@ def synthetic(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Render seeded street scenes in Cityscapes' layout or KITTI's."""
-    match = re.fullmatch(r"(\d+)x(\d+)", size)
-    if match is None:
-        raise ValueError(f"--size '{size}' is not HxW, such as 128x256")
-    height, width = map(int, match.groups())
+    height, width = o.size(size)
     from mtl_bench.data import scenes as scene_writer
     from mtl_bench.data.scenes.settings import CITYSCAPES, KITTI
 

@@ -10,9 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mtl_bench.cli import options as o
-from mtl_bench.core.recipe import Recipe
-
-TASKS = Recipe.tasks
 
 if TYPE_CHECKING:
     from mtl_bench.core.config import Cell
@@ -70,7 +67,7 @@ def latency(
         str,
         typer.Option(
             metavar="NAME|all",
-            help="plain, eager, compile, onnxruntime, openvino, tensorrt; all: one after another.",
+            help="One of mtl-bench list engines; all: one after another.",
         ),
     ] = "plain",
     precision: Annotated[
@@ -103,37 +100,37 @@ def latency(
     Its output is compared with the plain network's before. Without --data the built-in frames of
     the split val are looked at, resized to --size.
     """
-    from mtl_bench.bench import claim, results
-    from mtl_bench.engines import words
+    from mtl_bench.core import locks
+    from mtl_bench.core.files import write_json
 
-    claim.end_with_launcher()
+    locks.end_with_launcher()
     if ALL in (engine, precision):
         rows = _all(engine, precision, device)
-        for line in o.columns(words.table(rows)):
+        for line in o.columns(_table(rows)):
             typer.echo(line)
         if file is not None:
-            results.write_json(file, rows)
+            write_json(file, rows)
         _end([row["status"] for row in rows])
         return
     cell, model = _network(checkpoint, backbone, recipe, tasks, settings)
     root = o.data_root(cell, data)
     import torch
 
-    from mtl_bench import deploy
     from mtl_bench.core import provenance
     from mtl_bench.core.device import choose_device
-    from mtl_bench.engines import timed
+    from mtl_bench.deploy import timer
+    from mtl_bench.deploy.subject import subject
 
     chosen = choose_device(device.value)
     torch.set_num_threads(threads or provenance.cores())
-    subject = deploy.subject(
-        cell, model, size=_size(size), data=root, device=chosen, trained=checkpoint is not None
+    what = subject(
+        cell, model, size=o.size(size), data=root, device=chosen, trained=checkpoint is not None
     )
-    plan = timed.Plan(passes, seconds, batch, threads or provenance.cores())
-    row = timed.row(subject, engine, precision, chosen, plan)
+    plan = timer.Plan(passes, seconds, batch, threads or provenance.cores())
+    row = timer.row(what, engine, precision, chosen, plan)
     if file is not None:
-        results.write_json(file, row)
-    for line in words.lines(row):
+        write_json(file, row)
+    for line in _lines(row, f"limits {timer.SPREAD}, {timer.DRIFT}"):
         typer.echo(line)
     _end([row["status"]])
 
@@ -160,16 +157,12 @@ def export(
     The inputs' and outputs' names are printed; classes, size and cell id are in the metadata.
     """
     cell, model = _network(checkpoint, backbone, recipe, tasks, settings)
-    from mtl_bench import deploy
-    from mtl_bench import export as exporter
-    from mtl_bench.data.labels import labels_of
+    from mtl_bench.deploy import export as exporter
+    from mtl_bench.deploy.subject import check_size
 
-    deploy.check_size(cell, _size(size))
+    check_size(cell, o.size(size))
     origin = {} if checkpoint is None else {"cell_id": cell.id, "cell": cell.slug}
-    labels = labels_of(cell.recipe.data.dataset)
-    paths = exporter.export(
-        model.net.eval(), _size(size), out, labels, cell.recipe.evaluate, post, origin
-    )
+    paths = exporter.export(model.net.eval(), o.size(size), out, post, origin)
     import onnx
 
     for path in paths:
@@ -190,38 +183,34 @@ def _network(
     settings: list[str] | None,
 ) -> "tuple[Cell, Model]":
     """What to run: a checkpoint's network, or one with random weights."""
+    from mtl_bench.core import plugins as found
+
     if (checkpoint is None) == (backbone is None):
         raise ValueError("say which network: either --checkpoint RUN or --backbone NAME")
-    names = tuple(word.strip() for word in (tasks or "").split(",") if word.strip())
-    unknown = [name for name in names if name not in TASKS]
-    if unknown:
-        raise ValueError(f"no task called '{unknown[0]}' (known: {', '.join(TASKS)})")
-    from mtl_bench import deploy
-
+    names = o.names(tasks)
+    for name in names:
+        found.path_of("tasks", name)
     if checkpoint is not None:
         if recipe is not None or settings:
             raise ValueError("--recipe and --set go with --backbone: a checkpoint has its own")
-        return deploy.from_checkpoint(checkpoint, names or None)
+        from mtl_bench.bench.stored import deployed
+
+        return deployed(checkpoint, names or None)
     assert backbone is not None
-    return deploy.untrained(backbone, recipe, names or TASKS, settings or [])
+    from mtl_bench.deploy.subject import untrained
 
-
-def _size(text: str) -> tuple[int, int]:
-    height, _, width = text.partition("x")
-    if not (height.isdecimal() and width.isdecimal()):
-        raise ValueError(f"--size '{text}' is not HxW, such as 1024x2048")
-    return int(height), int(width)
+    return untrained(backbone, recipe, names, settings or [])
 
 
 def _all(engine: str, precision: str, device: o.Device) -> list[dict[str, Any]]:
     """Rows of several engines and precisions, each from a process of its own."""
-    from mtl_bench import engines
     from mtl_bench.core.device import choose_device
+    from mtl_bench.deploy import engines
 
     kind = choose_device(device.value).type
     rows = []
-    for name in engines.NAMES if engine == ALL else [engine]:
-        has = engines.PRECISIONS[name].get(kind, ())
+    for name in engines.names() if engine == ALL else [engine]:
+        has = engines.facts(name).precisions.get(kind, ())
         for wanted in (has or ("fp32",)) if precision == ALL else (precision,):
             if wanted in has or (engines.available(name) and wanted == "fp32"):
                 typer.echo(f"{name} {wanted} ...", err=True)
@@ -233,15 +222,8 @@ def _apart(name: str, precision: str) -> dict[str, Any]:
     """The row of this command with one engine, in a new process: its own threads and memory."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "row.json"
-        own = [
-            "--engine",
-            name,
-            "--precision",
-            precision,
-            "--json",
-            str(file),
-        ]  # the last one counts
-        command = [sys.executable, "-m", "mtl_bench", *sys.argv[1:], *own]
+        own = ["--engine", name, "--precision", precision, "--json", str(file)]
+        command = [sys.executable, "-m", "mtl_bench", *sys.argv[1:], *own]  # the last one counts
         done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         if not file.is_file():
             last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
@@ -254,3 +236,67 @@ def _end(statuses: list[str]) -> None:
     """A fast wrong engine is an error; one that is not installed is not."""
     if {"wrong", "failed"} & set(statuses):
         raise typer.Exit(1)
+
+
+# --- rows as text ---------------------------------------------------------------------------------
+
+
+def _lines(row: dict[str, Any], limits: str) -> list[str]:
+    """What a row says."""
+    what = f"{row['backbone']} {','.join(row['tasks'])} {row['height']}x{row['width']}"
+    head = f"{what} {row['engine']} {row['precision']}, {row['weights']} weights"
+    if row["status"] != "done":
+        return [head, f"  {row['status']}: {row['why']}"]
+    m = {key.partition(".")[2]: value for key, value in row["metric"].items()}
+    noise = f"  spread {m['spread']:.2f}, drift {m['drift']:+.2f}"
+    noise += f": noisy ({limits}), take it again" if m["noisy"] else ""
+    return [
+        head,
+        f"  {m['mean_ms']:.1f} ms (p50 {m['p50_ms']:.1f}, p95 {m['p95_ms']:.1f}, p99 "
+        f"{m['p99_ms']:.1f}, std {m['std_ms']:.1f})  FPS {m['fps']:.2f}",
+        f"  transfer {m['transfer_ms']:.1f}, network {m['network_ms']:.1f}, post-processing "
+        f"{m['postprocess_ms']:.1f} ms",
+        f"  {m['passes']} passes after {m['warmup']}, {m['images']} images, {m['threads']} "
+        f"threads, {m['device']}",
+        noise,
+        f"  throughput {m['throughput_fps']:.2f} images a second at batch {m['throughput_batch']}",
+        f"  {m['gmacs']:.1f} G multiply-adds, {m['network_mb']:.0f} MB; machine "
+        f"{m['peak_gflops']:.0f} GFLOP/s, {m['peak_gbs']:.1f} GB/s: share {m['share']:.2f}",
+        f"  against plain: {_agreement(row)}",
+    ]
+
+
+def _agreement(row: dict[str, Any]) -> str:
+    """Equal ids first, then classes' logits, then quantities."""
+    words: dict[str, str] = {}
+    for key, value in row["metric"].items():
+        what, _, measure = key.removeprefix("agreement.").partition("_")
+        if measure == "equal":
+            words["0" + what] = f"{100 * value:.3f} % {what} pixels"
+        elif measure == "max":
+            words["1" + what] = f"{what} {value:.1g}"
+        elif measure == "median_rel":
+            most = row["metric"][f"agreement.{what}_max_rel"]
+            words["2" + what] = f"{what} {value:.1g} (largest {most:.1g})"
+    return ", ".join(words[key] for key in sorted(words))
+
+
+def _table(rows: list[dict[str, Any]]) -> list[list[str]]:
+    """Several rows, line by line, the head first; `faster` is than plain's."""
+    head = ["engine", "precision", "ms", "p95", "FPS", "transfer", "network", "post", "faster"]
+    lines = [[*head, "against plain"]]
+    done = {(row["engine"], row["precision"]): row["metric"] for row in rows}
+    plain = done.get(("plain", "fp32"), {}).get("latency.mean_ms")
+    for row in rows:
+        m = row["metric"]
+        if row["status"] != "done":
+            about = f"{row['status']}: {row['why']}"
+            lines.append([row["engine"], row["precision"], *[""] * 7, about])
+            continue
+        stages = ("mean", "p95", "transfer", "network", "postprocess")
+        mean, p95, *times = (f"{m[f'latency.{key}_ms']:.1f}" for key in stages)
+        faster = "" if plain is None else f"{plain / m['latency.mean_ms']:.2f}x"
+        noisy = ", noisy" if m["latency.noisy"] else ""
+        values = [mean, p95, f"{m['latency.fps']:.2f}", *times, faster, _agreement(row) + noisy]
+        lines.append([row["engine"], row["precision"], *values])
+    return lines

@@ -1,21 +1,20 @@
-"""`ablate`, `status` and `report`: a grid of cells."""
+"""`ablate`, `status` and `report`: a grid of cells or of timings."""
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mtl_bench.cli import latency_grid, tables, trivial
 from mtl_bench.cli import options as o
-from mtl_bench.cli.choice import Choice
 from mtl_bench.core.config import Cell
 
 if TYPE_CHECKING:
     from mtl_bench.bench.grid import Grid
+    from mtl_bench.bench.jobs import Job, Timing
 
 
 class Rerun(StrEnum):
@@ -72,33 +71,38 @@ def ablate(
     Cells that are done are reused, interrupted and failed ones tried again; cells that others need
     run before them, be they in the grid or not. A grid of latencies takes them one at a time.
     """
-    from mtl_bench.bench import launch
-    from mtl_bench.core.plugins import check_cells
+    from mtl_bench.bench import references, store
+    from mtl_bench.bench.jobs import CELLS
 
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
-    if choice.is_latency:
-        where = (data, runs, reports)
-        latency_grid.ablate(choice, dry_run, jobs, rerun, *where, device, wandb, quiet)
-        return
-    chosen = choice.load()
-    check_cells(chosen.cells)
-    todo = launch.to_run(chosen.cells, runs, rerun)
-    for cell in [] if dry_run else todo:
-        o.locate(cell, data)  # a wrong folder is told at once
+    chosen = choice.load(device)
+    if chosen.kind is not CELLS and jobs > 1:
+        raise ValueError(f"--jobs {jobs}: a latency is taken with nothing else of ours running")
+    if chosen.kind is not CELLS and wandb is not o.Wandb.off:
+        raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
+    chosen.kind.check(chosen.jobs)
+    todo = store.to_run(chosen.jobs, runs, rerun)
+    for job in [] if dry_run else todo:
+        if isinstance(job, Cell):
+            o.locate(job, data)  # a wrong folder is told at once
     if not quiet or dry_run:
         _announce(chosen, todo, runs)
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
         return
-    options = ["--device", device.value, "--wandb", wandb.value]
     if todo:
-        _run(chosen, todo, runs, data, options, jobs, rerun, quiet)
-    _baseline(chosen, data, runs, quiet, refresh=bool(todo))
-    page = _write(chosen, runs, reports, choice.command)
-    words = [row["status"] for row in _rows(chosen, runs)]
-    bad = sum(word not in ("done", "stale") for word in words)
+        _run(chosen, todo, runs, data, ["--wandb", wandb.value], device, jobs, rerun, quiet)
+    if chosen.kind is CELLS:
+        references.measure_trivial(
+            chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=bool(todo)
+        )
+    rows = _rows(chosen, runs)
+    page = _write(chosen, rows, runs, reports, choice.command)
+    words = [row["status"] for row in rows]
+    bad = any(word not in chosen.kind.good for word in words)
     if bad or not quiet:
-        typer.echo(f"{len(words) - bad} of {len(words)} cells done; report: {page}")
+        done = sum(word in ("done", "stale") for word in words)
+        typer.echo(f"{done} of {len(words)} {chosen.kind.noun}s done; report: {page}")
     if bad:
         raise typer.Exit(1)
 
@@ -117,34 +121,50 @@ def status(
 
     Those that are in no row of the grid but needed by one are marked as such.
     """
-    from mtl_bench.bench import launch, results
-    from mtl_bench.bench.grid import with_parents
-    from mtl_bench.cli.display import label
+    from mtl_bench.bench import store
+    from mtl_bench.bench.jobs import TIMINGS, with_parents
+    from mtl_bench.core.locks import claimed_by
 
-    choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
-    if choice.is_latency:
-        latency_grid.status(choice, runs)
-        return
-    chosen = choice.load()
-    own, every = {cell.id for cell in chosen.cells}, with_parents(chosen.cells)
+    chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
+    own, every = {job.id for job in chosen.jobs}, with_parents(chosen.jobs)
     lines = []
-    for cell in every:
-        state = results.inspect(cell, runs)
+    for job in every:
+        state = store.inspect(job, runs)
         about = "  ".join(filter(None, (state.why, state.headline)))
-        name = chosen.names.get(cell.id, "") if cell.id in own else "(needed by another)"
-        named = [name] if chosen.names or len(every) > len(own) else []
-        place = str(results.run_dir(cell, runs))
-        lines.append([state.word, *named, label(cell), place, about])
-    for line in o.columns(lines):
+        if isinstance(job, Cell):
+            name = chosen.names.get(job.id, "") if job.id in own else "(needed by another)"
+            named = [name] if chosen.names or len(every) > len(own) else []
+            what = [*named, job.label, str(store.run_dir(job, runs))]
+        else:
+            what = [*job.words, job.id]
+        lines.append([state.word, *what, about])
+    for line in [*o.columns(lines), *_skipped(chosen), store.summary(chosen.kind, every, runs)]:
         typer.echo(line)
-    for skip in chosen.skips:
-        typer.echo(f"  skipped: {label(skip.cell)}: {skip.why}")
-    typer.echo(launch.summary(every, runs))
+    owner = claimed_by(runs / "latency") if chosen.kind is TIMINGS else None
+    if owner is not None:
+        typer.echo(f"process {owner.get('pid', '?')} is timing now")
 
 
 def report(
-    grid: tables.GridOption = None,
-    table: tables.TableOption = None,
+    grid: Annotated[
+        str | None,
+        typer.Option(
+            "--grid",
+            metavar="NAME|FILE",
+            help="A grid's name, or a .toml of your own.",
+            show_default=False,
+        ),
+    ] = None,
+    table: Annotated[
+        str | None,
+        typer.Option(
+            "--table",
+            metavar="NAME",
+            help="cityscapes or kitti: the paper's comparison with the rows of --grid, or of all "
+            "cells in --runs, among the published ones; in place of a grid's report.",
+            show_default=False,
+        ),
+    ] = None,
     recipe: o.RecipeOption = None,
     seeds: o.SeedsOption = None,
     smoke: o.SmokeOption = False,
@@ -163,21 +183,20 @@ def report(
     plugins: o.PluginsOption = None,
 ) -> None:
     """Write a grid's tables, plots and page from the rows that there are."""
-    if table is not None or grid is None:
-        choices = (recipe, seeds, smoke, settings, pretrained)
-        tables.write(table, Choice(grid, *choices) if grid else None, runs, reports, smoke)
+    choice = Choice(grid, recipe, seeds, smoke, settings, pretrained) if grid else None
+    if table is not None:
+        _write_table(table, choice, runs, reports, smoke)
         return
-    choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
-    if choice.is_latency:
-        page = latency_grid.report(choice, runs, reports)
-    else:
-        chosen = choice.load()
-        if not any("metric" in row for row in _rows(chosen, runs)):
-            raise ValueError(
-                f"no cell of grid '{chosen.name}' is done in '{runs}': "
-                f"mtl-bench ablate --grid {grid}"
-            )
-        page = _write(chosen, runs, reports, choice.command)
+    if choice is None:
+        raise ValueError("nothing to report: say --grid NAME or --table NAME")
+    chosen = choice.load()
+    rows = _rows(chosen, runs)
+    if not any("code" in row for row in rows):
+        raise ValueError(
+            f"no {chosen.kind.noun} of grid '{chosen.name}' is done in '{runs}': "
+            f"mtl-bench ablate --grid {grid}"
+        )
+    page = _write(chosen, rows, runs, reports, choice.command)
     typer.echo(str(page))
     if readme is not None:
         from mtl_bench.report.readme import update
@@ -189,104 +208,171 @@ def report(
 # --- steps ----------------------------------------------------------------------------------------
 
 
-def _announce(grid: "Grid", todo: Sequence[Cell], runs: Path) -> None:
-    from mtl_bench.bench import launch
-    from mtl_bench.bench.grid import with_parents
-    from mtl_bench.cli.display import label
+@dataclass(frozen=True)
+class Choice:
+    """What was said about which jobs to take."""
 
-    size, cells = grid.recipe.data, with_parents(grid.cells)
+    grid: str
+    recipe: str | None
+    seeds: int | None
+    smoke: bool
+    settings: list[str] | None
+    pretrained: str | None
+
+    def load(self, device: o.Device = o.Device.auto) -> "Grid":
+        from mtl_bench.bench.grid import load_grid
+
+        return load_grid(
+            self.grid,
+            recipe=self.recipe,
+            seeds=self.seeds,
+            smoke=self.smoke,
+            settings=self.settings or [],
+            pretrained=o.weights(self.pretrained),
+            device=device.value,
+        )
+
+    @property
+    def command(self) -> str:
+        """How to run the same jobs again; files without their folders."""
+        words = ["mtl-bench", "ablate", "--grid", Path(self.grid).name]
+        for option, value in (
+            ("--recipe", self.recipe and Path(self.recipe).name),
+            ("--seeds", self.seeds),
+            ("--pretrained", self.pretrained and Path(self.pretrained).name),
+        ):
+            words += [option, str(value)] if value is not None else []
+        words += ["--smoke"] * self.smoke
+        for setting in self.settings or []:
+            words += ["--set", setting]
+        return shlex.join(words)
+
+
+def _announce(grid: "Grid", todo: "Sequence[Job]", runs: Path) -> None:
+    from mtl_bench.bench import store
+    from mtl_bench.bench.jobs import CELLS, with_parents
+
+    every = with_parents(grid.jobs)
     counts = {axis: len(values) for axis, values in grid.axes.items()}
     counts |= {"row": len(set(grid.names.values()))} if grid.names else {}
-    product = " x ".join(f"{n} {axis}{'s' * (n > 1)}" for axis, n in counts.items())
-    needed = len(cells) - len(grid.cells)
-    more = f" and {needed} that they need" if needed else ""
+    product = " x ".join(f"{n} {a}{'s' * (n > 1 and a[-1] != 's')}" for a, n in counts.items())
+    if grid.kind is CELLS:
+        recipe: Any = grid.recipe
+        size, needed = recipe.data, len(every) - len(grid.jobs)
+        more = f" and {needed} that they need" if needed else ""
+        steps = f"{size.dataset}, {size.height}x{size.width}, {recipe.optim.steps} steps"
+        about = f"recipe {recipe.name} ({steps})"
+    else:
+        first = grid.jobs[0]
+        more = f" of {first.passes} passes on {first.device}"
+        about = f"network of recipe {first.recipe}"
     typer.echo(f"{grid.name}: {grid.question}")
     typer.echo(
-        f"{len(grid.cells)} cells{more} = {product}, less {len(grid.skips)} skipped; recipe "
-        f"{grid.recipe.name} ({size.dataset}, {size.height}x{size.width}, "
-        f"{grid.recipe.optim.steps} steps)"
+        f"{len(grid.jobs)} {grid.kind.noun}s{more} = {product}, less {len(grid.skips)} skipped; "
+        f"{about}"
     )
-    hours = launch.hours_to_run(todo, cells, runs)
+    hours = store.hours_to_run(todo, every, runs)
     about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
-    typer.echo(f"  {launch.summary(cells, runs)}   to run {len(todo)}{about}")
-    for skip in grid.skips:
-        typer.echo(f"  skipped: {label(skip.cell)}: {skip.why}")
+    typer.echo(f"  {store.summary(grid.kind, every, runs)}   to run {len(todo)}{about}")
+    for line in _skipped(grid):
+        typer.echo(line)
+
+
+def _skipped(grid: "Grid") -> list[str]:
+    """A line for each cell, or for each reason why timings are skipped."""
+    from mtl_bench.bench.jobs import CELLS
+
+    if grid.kind is CELLS:
+        return [f"  skipped: {skip.job.label}: {skip.why}" for skip in grid.skips]
+    reasons = [skip.why for skip in grid.skips]
+    return [f"  skipped {reasons.count(why)}: {why}" for why in dict.fromkeys(reasons)]
 
 
 def _run(
     grid: "Grid",
-    todo: Sequence[Cell],
+    todo: "Sequence[Job]",
     runs: Path,
     data: Path | None,
     options: list[str],
+    device: o.Device,
     jobs: int,
     rerun: str | None,
     quiet: bool,
 ) -> None:
     """Render what is missing first, once, so that cells side by side find it; then run them."""
-    from mtl_bench.bench import launch
+    from mtl_bench.bench import jobs as kinds
+    from mtl_bench.bench.launch import Launcher
     from mtl_bench.cli import display
 
-    roots = {cell.recipe.data: o.data_root(cell, data, quiet) for cell in todo}
-    passed_on = [*options, *(["--quiet"] if quiet else [])]
+    cells = [job for job in todo if isinstance(job, Cell)]
+    roots = {cell.recipe.data: o.data_root(cell, data, quiet) for cell in cells}
+    passed_on = ["--device", device.value, *options, *(["--quiet"] if quiet else [])]
 
-    def command(cell: Cell) -> list[str]:
-        return launch.cell_command(cell, runs, roots[cell.recipe.data], passed_on)
+    def of_cell(cell: Cell) -> list[str]:
+        return kinds.cell_command(cell, runs, roots[cell.recipe.data], passed_on)
 
-    with display.choose(len(todo), quiet) as shown:
-        launch.Launcher(runs, command, shown, jobs, rerun, grid.names).run(todo)
+    def of_timing(timing: "Timing", file: Path) -> list[str]:
+        return kinds.timing_command(timing, file, data)
+
+    command = of_cell if grid.kind is kinds.CELLS else of_timing
+    bars = grid.kind is kinds.CELLS  # which would draw while something is timed
+    with display.choose(len(todo), quiet, bars) as shown:
+        launcher = Launcher(runs, command, shown, jobs, rerun, grid.names, smoke=grid.smoke)
+        launcher.run(todo)
 
 
 def _rows(grid: "Grid", runs: Path) -> list[dict[str, Any]]:
-    """One row a cell, with its deltas to the stored row of its baseline."""
-    from mtl_bench.bench import results
+    """One row a job; of cells with their deltas to the stored row of their baseline."""
+    from mtl_bench.bench import references, store
 
-    rows = results.rows(grid.cells, runs, grid.names)
+    rows = store.rows(grid.jobs, runs, grid.names)
     if not grid.baseline:
         return rows
-    from mtl_bench.bench.grid import baseline_cell
     from mtl_bench.report.delta import with_delta
 
-    cells = {cell.id: cell for cell in grid.cells}
-
-    def baseline_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
-        cell = baseline_cell(cells[row["cell_id"]], grid.baseline)
-        stored = results.rows([cell], runs)[0]
-        return stored if "metric" in stored else None
-
-    return with_delta(rows, baseline_of)
+    return with_delta(rows, lambda row: references.baseline_row(grid, row, runs))
 
 
-def _write(grid: "Grid", runs: Path, reports: Path, command: str) -> Path:
-    from mtl_bench.report import grid as reporting
+def _write(
+    grid: "Grid", rows: list[dict[str, Any]], runs: Path, reports: Path, command: str
+) -> Path:
+    from mtl_bench.bench import references
+    from mtl_bench.bench.jobs import CELLS
 
-    file = trivial.file_of(grid, runs)
-    baseline = json.loads(file.read_text()) if file is not None and file.is_file() else None
-    return reporting.build(
-        grid,
-        _rows(grid, runs),
-        reports / grid.name,
-        runs_root=runs,
-        baseline=baseline,
-        command=command,
-    )
+    out = reports / grid.name
+    if grid.kind is CELLS:
+        from mtl_bench.report import grid as of_cells
+
+        trivial = references.trivial(grid, runs)
+        return of_cells.build(grid, rows, out, runs_root=runs, baseline=trivial, command=command)
+    from mtl_bench.report import latency as of_timings
+
+    return of_timings.build(grid, rows, out, references.quality(grid, runs), command)
 
 
-def _baseline(
-    grid: "Grid", data: Path | None, runs: Path, quiet: bool, refresh: bool = False
-) -> None:
-    """Measure the trivial predictors on the grid's data set (`baselines` keeps what it did once).
+def _write_table(name: str, choice: Choice | None, runs: Path, reports: Path, smoke: bool) -> None:
+    """Measured rows among the published ones of a comparison; say where, and what it lacks.
 
-    Not refreshed when no cell ran: then the numbers beside them are the old ones, too.
+    Args:
+        choice: whose rows; None: those of all cells in `runs`.
+        smoke: smoke rows alone, in a folder of their own.
+
+    Raises:
+        ValueError: no such table, or a damaged row.
     """
-    from mtl_bench.bench import results
+    from mtl_bench.bench import store
+    from mtl_bench.report import literature
 
-    file = trivial.file_of(grid, runs)
-    if file is None or (file.is_file() and not refresh):
-        return
-    from mtl_bench.evaluate.trivial import baselines
-
-    file.parent.mkdir(parents=True, exist_ok=True)
-    root = o.data_root(grid.cells[0], data, quiet)
-    cell = replace(grid.cells[0], tasks=trivial.tasks_of(grid), video=False, single_task=False)
-    results.write_json(file, baselines(cell, root, file.parent).metrics)
+    known = literature.load(name)
+    if choice is None:
+        rows = store.all_rows(runs)
+        command = shlex.join(["mtl-bench", "report", "--table", name, *["--smoke"] * smoke])
+    else:
+        rows = store.rows(choice.load().cells, runs)
+        command = choice.command.replace("ablate", f"report --table {name}", 1)
+    table = literature.compare(known, rows, smoke)
+    page = literature.write(table, reports / f"tables-{name}{'-smoke' * smoke}", command)
+    if not table.measured:
+        kind = "finished smoke cell" if smoke else "finished cell"
+        typer.echo(f"no {kind} in '{runs}' belongs to table '{name}': published rows only")
+    typer.echo(str(page))

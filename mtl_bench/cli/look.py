@@ -16,6 +16,9 @@ class What(StrEnum):
     all = "all"
     methods = "methods"
     backbones = "backbones"
+    tasks = "tasks"
+    datasets = "datasets"
+    engines = "engines"
     recipes = "recipes"
     grids = "grids"
 
@@ -23,6 +26,7 @@ class What(StrEnum):
 class Kind(StrEnum):
     method = "method"
     backbone = "backbone"
+    engine = "engine"
 
 
 def register(app: typer.Typer) -> None:
@@ -43,7 +47,7 @@ def show(
     ] = False,
     plugins: o.PluginsOption = None,
 ) -> None:
-    """List methods, backbones, recipes and grids, without importing any."""
+    """List methods, backbones, tasks, data sets, engines, recipes and grids; imports none."""
     if markdown:
         typer.echo(_page(what), nl=False)
         return
@@ -74,7 +78,21 @@ def _lines(kind: str, verbose: bool) -> list[str]:
     if verbose:
         return [line for about in described for line in _whole(about)]
     broken = {about.name: f"BROKEN: {about.error}" for about in described if about.error}
+    if kind == "engines":
+        return o.columns([_engine(about) for about in described if not about.error]) + o.columns(
+            [[name, error] for name, error in broken.items()]
+        )
     return o.columns([[about.name, broken.get(about.name, about.summary)] for about in described])
+
+
+def _engine(about: Description) -> list[str]:
+    """Name, precisions, what it is, and what is not installed."""
+    from mtl_bench.core.plugins import lack
+    from mtl_bench.deploy import engines
+
+    facts = engines.facts(about.name)
+    lacking = lack(facts.packages, facts.extra)
+    return [about.name, facts.text, about.summary + (f" ({lacking})" if lacking else "")]
 
 
 def _whole(about: Description, details: Sequence[str] = ()) -> list[str]:
@@ -97,10 +115,10 @@ def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Lower-case letters, digits and _.")],
     folder: Annotated[
         Path | None,
-        typer.Option("--dir", metavar="DIR", help="Where. [default: ./methods or ./backbones]"),
+        typer.Option("--dir", metavar="DIR", help="Where. [default: ./methods, or as the kind]"),
     ] = None,
 ) -> None:
-    """Write a commented file to start a method or a backbone from; it passes `check` as it is."""
+    """Write a commented file to start a method, backbone or engine from; it passes `check`."""
     from mtl_bench.bench.scaffold import write
 
     path = write(f"{kind.value}s", name, folder)
@@ -112,12 +130,13 @@ def new(
 def check(
     names: Annotated[
         list[str],
-        typer.Argument(metavar="NAME|FILE...", help="Methods or backbones, by name or by file."),
+        typer.Argument(metavar="NAME|FILE...", help="Plug-ins of any kind, by name or by file."),
     ],
     plugins: o.PluginsOption = None,
 ) -> None:
     """Run the tests that every plug-in has to pass; exit code 1 if one fails."""
-    from mtl_bench.core.plugins import KINDS, add_folder, did_you_mean, files, kinds_of
+    from mtl_bench.core.plain import did_you_mean
+    from mtl_bench.core.plugins import KINDS, add_folder, files, kinds_of
 
     chosen = []
     for word in names:
@@ -128,12 +147,13 @@ def check(
         kinds = kinds_of(name)
         if not kinds and word.endswith(".py"):
             raise ValueError(
-                f"{word} is neither: a method imports mtl_bench.core.method, a backbone "
-                "mtl_bench.core.backbone"
+                f"{word} is none: a plug-in imports mtl_bench.core.method, backbone, task, dataset "
+                "or engine"
             )
         if not kinds:
             known = [known for kind in KINDS for known in files(kind)]
-            raise ValueError(f"no method or backbone called '{name}'{did_you_mean(name, known)}")
+            hint = did_you_mean(name, known)
+            raise ValueError(f"no method, backbone or engine called '{name}'{hint}")
         chosen += [(kind, name) for kind in kinds]
     from mtl_bench.bench.check import check as check_plugin
 

@@ -10,6 +10,8 @@ import typer
 from mtl_bench.core.config import Cell
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from mtl_bench.core.dataset import Dataset
 
 RUNNING, GRID = "Where and how to run", "Which cells"
@@ -40,8 +42,8 @@ PluginsOption = Annotated[
     typer.Option(
         "--plugins",
         metavar="DIR",
-        help="More methods and backbones: a folder with methods/ and backbones/ or with the files "
-        "themselves, or one file. Repeatable.",
+        help="More plug-ins: a folder with methods/, backbones/, tasks/, datasets/ or engines/ in "
+        "it or with the files themselves, or one file. Repeatable.",
         callback=_add_plugins,
         is_eager=True,
         show_default=False,
@@ -130,6 +132,35 @@ SmokeOption = Annotated[
 def names(words: str | None) -> tuple[str, ...]:
     """`a,b` as names; none where nothing is said."""
     return tuple(word.strip() for word in (words or "").split(",") if word.strip())
+
+
+def size(text: str) -> tuple[int, int]:
+    """Height and width.
+
+    Raises:
+        ValueError: not HxW.
+    """
+    height, _, width = text.lower().partition("x")
+    if not (height.isdecimal() and width.isdecimal()):
+        raise ValueError(f"--size '{text}' is not HxW, such as 128x256")
+    return int(height), int(width)
+
+
+def bar(title: str, quiet: bool, *more: str) -> "Progress":
+    """A bar on stderr with the number done and the time left."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    middle: list[ProgressColumn] = [BarColumn(), MofNCompleteColumn(), *map(TextColumn, more)]
+    columns: list[str | ProgressColumn] = [title, *middle, TimeRemainingColumn()]
+    return Progress(*columns, console=Console(stderr=True), disable=quiet)
 
 
 def echo(quiet: bool) -> Callable[[str], None]:

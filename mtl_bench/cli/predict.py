@@ -117,7 +117,7 @@ def predict(
     given = Given(camera, calib, _focal_and_center(fx, fy, cx, cy), camera_height)
     paths = predictions.find(inputs)
     video = predictions.is_video(paths)
-    predictor = _predictor(checkpoint, _size(size), device)
+    predictor = _predictor(checkpoint, None if size is None else o.size(size), device)
     job = predictions.Job(predictor, given, _kinds(what, video, predictor.cell.tasks))
     run = predictions.predict_video if video else predictions.predict_images
     with (
@@ -136,15 +136,12 @@ def predict(
 
 def _predictor(checkpoint: Path, size: tuple[int, int] | None, device: o.Device) -> "Predictor":
     """The checkpoint's model, ready to be asked."""
-    from mtl_bench.bench import results
+    from mtl_bench.bench.jobs import load_run
     from mtl_bench.bench.stored import load_model
     from mtl_bench.core.device import Engine, choose_device
     from mtl_bench.show.predict import Predictor
 
-    if not checkpoint.exists():
-        raise ValueError(f"no run or checkpoint '{checkpoint}'")
-    weights = checkpoint / "last.pt" if checkpoint.is_dir() else checkpoint
-    cell = results.load_cell(weights.parent / "cell.json")
+    cell, weights = load_run(checkpoint)
     engine = Engine(choose_device(device.value), cell.recipe.optim.precision)
     return Predictor(load_model(cell, weights, engine), cell, engine.device, size)
 
@@ -155,27 +152,19 @@ def _kinds(what: str | None, video: bool, tasks: tuple[str, ...]) -> list[str]:
     Raises:
         ValueError: an unknown kind, or one of a task that the cell lacks.
     """
-    from mtl_bench.show.predict.files import NEEDS
+    from mtl_bench.core.quality import declared, in_turns
 
+    pairs = in_turns([(k, task) for k in kinds] for task, kinds in declared("files").items())
+    task_of = dict(pairs)
     if what is None:
-        return [] if video else [kind for kind, task in NEEDS.items() if task in tasks]
+        return [] if video else [kind for kind, task in task_of.items() if task in tasks]
     kinds = [word.strip() for word in what.split(",") if word.strip()]
     for kind in kinds:
-        if kind not in NEEDS:
-            raise ValueError(f"--what '{kind}' is none of {', '.join(NEEDS)}")
-        if NEEDS[kind] not in tasks:
-            raise ValueError(f"--what {kind} takes the task {NEEDS[kind]}, which the cell lacks")
+        if kind not in task_of:
+            raise ValueError(f"--what '{kind}' is none of {', '.join(task_of)}")
+        if task_of[kind] not in tasks:
+            raise ValueError(f"--what {kind} takes the task {task_of[kind]}, which the cell lacks")
     return kinds
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    """Raises: ValueError: not HxW."""
-    if text is None:
-        return None
-    height, _, width = text.lower().partition("x")
-    if not (height.isdecimal() and width.isdecimal()):
-        raise ValueError(f"--size '{text}' is not HxW, such as 256x512")
-    return int(height), int(width)
 
 
 def _focal_and_center(
@@ -192,18 +181,7 @@ def _focal_and_center(
 @contextmanager
 def _progress(job: "Job", quiet: bool) -> Iterator[None]:
     """A bar on stderr with frames a second, while the job runs."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
-    speed = TextColumn("{task.fields[fps]:.1f} FPS")
-    columns = ("predicting", BarColumn(), MofNCompleteColumn(), speed, TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
+    with o.bar("predicting", quiet, "{task.fields[fps]:.1f} FPS") as bar:
         task = bar.add_task("", total=None, fps=0.0)
 
         def show(done: int, total: int) -> None:

@@ -66,18 +66,12 @@ def pseudo_label(
 ) -> None:
     """Label the frames of Cityscapes' sequences that no human labelled, or KITTI's, with a network
     that was trained on Cityscapes. No label is overwritten."""
-    from mtl_bench.bench import results
+    from mtl_bench.bench.jobs import load_run
 
-    if not checkpoint.exists():
-        raise ValueError(f"no run or checkpoint '{checkpoint}'")
-    weights = checkpoint / "last.pt" if checkpoint.is_dir() else checkpoint
-    cell = results.load_cell(weights.parent / "cell.json")
+    cell, weights = load_run(checkpoint)
     chosen = _options(cell.recipe.pseudo, scales, flip, min_confidence)
     cell = replace(cell, recipe=replace(cell.recipe, pseudo=chosen))
     root = o.any_root(cell, data, quiet)
-
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from mtl_bench.bench.stored import load_model
     from mtl_bench.core.dataset import dataset_in, dataset_of
@@ -90,8 +84,7 @@ def pseudo_label(
     if maker is None:
         raise ValueError(f"cell {cell.slug} has no task that makes labels")
     counts: list[int] = []  # frames that have labels: at the start, and after each
-    columns = ("labelling frames", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
+    with o.bar("labelling frames", quiet) as bar:
         shown = bar.add_task("")
 
         def show(done: int, total: int) -> None:

@@ -9,10 +9,10 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 from mtl_bench.core import plugins
+from mtl_bench.core.fingerprint import ancestry, forget_edited, load, of_package
 from mtl_bench.core.plugins import Description
 
 VENUE = re.compile(r"\b([A-Z][A-Za-z]+) ((?:19|20)\d\d)\b")
@@ -20,7 +20,7 @@ PREPRINT = re.compile(r"\barXiv:(\d{4}\.\d{4,5})")
 ADDRESS = re.compile(r"\b(?:https?://)?((?:[a-z]+\.)+[a-z]{2,}/[^\s,;)]+)")
 HEADING = re.compile(r"^(?:Args|Raises):$", re.MULTILINE)
 
-CONTRACT = plugins.PACKAGE / "core" / "method.py"
+CONTRACT = of_package("core.method"), "Method"
 LEGEND = (
     "Cost of a step: F forward pass, B ordinary backward pass. Of each of K losses, H is the "
     "backward pass through its decoder, T the one through the shared encoder."
@@ -34,7 +34,7 @@ class Card:
     venue: str = ""  # of its source; empty where the file names none
     year: str = ""
     url: str = ""
-    needs: str = ""  # losses | gradients | representation; empty in a broken file
+    needs: str = ""  # losses | gramian | representation | jacobian; empty in a broken file
     extras: tuple[str, ...] = ()  # what it asks for beyond that
     cost: str = ""  # of a step, in the letters of LEGEND
     settings: Mapping[str, str] = field(default_factory=dict)  # name -> default, as Python text
@@ -42,6 +42,7 @@ class Card:
 
 def cards() -> list[Card]:
     """One for every method that is found, in order of name."""
+    forget_edited()
     return [_card(about) for about in plugins.describe("methods")]
 
 
@@ -57,11 +58,17 @@ def _card(about: Description) -> Card:
         venue=published[1] if published else "",
         year=published[2] if published else "",
         url=_url(source),
-        needs=_needs(line),
+        needs=str(_declared(line).get("needs", "")),
         extras=tuple(_extras(line)),
         cost=_cost(line),
         settings=_settings(line),
     )
+
+
+def _line_in(path: Path) -> list[ast.ClassDef]:
+    """The file's method, its base, the base's base, ...; empty if no class leads to `Method`."""
+    lines = (ancestry(path, name) for name in load(path).statements)
+    return next((list(line.values()) for line in lines if CONTRACT in [*line][1:]), [])
 
 
 def _source(doc: str) -> str:
@@ -75,47 +82,6 @@ def _url(source: str) -> str:
     if preprint:
         return f"https://arxiv.org/abs/{preprint[1]}"
     return f"https://{address[1].rstrip('.')}" if address else ""
-
-
-# --- classes as text: a line is a class, its base, the base's base, ... ---------------------------
-
-
-def _line_in(path: Path) -> list[ast.ClassDef]:
-    """The line of the file's method, down to `Method`; empty if no class leads there."""
-    lines = (_line_of(node, path) for node in _classes(path))
-    return next((line for line in lines if line[-1].name == "Method"), [])
-
-
-def _line_of(node: ast.ClassDef, path: Path) -> list[ast.ClassDef]:
-    for base in node.bases:
-        name = ast.unparse(base).rpartition(".")[2]
-        for place in (path, *_beside(path), CONTRACT):
-            for found in _classes(place):
-                if found.name == name and found is not node:
-                    return [node, *_line_of(found, place)]
-    return [node]
-
-
-def _beside(path: Path) -> Iterator[Path]:
-    """The files that `from .name import ...` reads."""
-    for node in _tree(path).body:
-        if isinstance(node, ast.ImportFrom) and node.level == 1 and node.module:
-            beside = path.with_name(f"{node.module}.py")
-            if beside.is_file():
-                yield beside
-
-
-def _classes(path: Path) -> list[ast.ClassDef]:
-    return [node for node in _tree(path).body if isinstance(node, ast.ClassDef)]
-
-
-def _tree(path: Path) -> ast.Module:
-    return _parse(path.read_bytes())
-
-
-@cache
-def _parse(text: bytes) -> ast.Module:
-    return ast.parse(text)
 
 
 # --- what a line of classes declares --------------------------------------------------------------
@@ -143,12 +109,6 @@ def _is_a(line: Sequence[ast.ClassDef], base: str) -> bool:
     return base in [node.name for node in line]
 
 
-def _needs(line: Sequence[ast.ClassDef]) -> str:
-    if _is_a(line, "LossMethod"):
-        return "losses"
-    return "representation" if _declared(line).get("space") == "representation" else "gradients"
-
-
 def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
     values = _declared(line)
     if values["reevaluates"]:
@@ -157,21 +117,20 @@ def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
         yield "the gradients of a second batch ahead"
     elif values["batches"] != 1:
         yield f"{values['batches']} batches"
-    own_heads = values.get("weighted_heads") or len(_definitions(line, "head_weights")) > 1
-    if own_heads or _is_a(line, "Composed"):
+    if values.get("weighted_heads") or _is_a(line, "Composed"):
         yield "weighted decoders"
 
 
 def _cost(line: Sequence[ast.ClassDef]) -> str:
     """As `backward` spends it; what the method itself computes is not in it."""
-    values, needs = _declared(line), _needs(line)
-    if needs == "losses":
+    values = _declared(line)
+    if values.get("needs") == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
     if _is_a(line, "CrossMethod"):  # decoders' own parameters only of the third
         return "3F + 2K(H + T) + KH + 1T"
     batches = values["batches"]
     each = "" if batches == 1 else batches
-    if needs == "representation":
+    if values.get("needs") == "representation":
         return f"{batches}F + {each}KH + {batches}T"
     return f"{batches}F + {each}K(H + T)"
 

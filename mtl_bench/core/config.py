@@ -100,6 +100,16 @@ class Cell:
         """Name of the run's folder."""
         return f"{self.method}-{self.backbone}-s{self.seed}-{self.id}"
 
+    @property
+    def label(self) -> str:
+        """What a reader tells cells of one grid apart by, in a few words."""
+        words = [self.method, self.backbone, f"s{self.seed}"]
+        words += [] if self.tasks == self.recipe.tasks else [",".join(self.tasks)]
+        words += ["single-task"] * self.single_task + ["video"] * self.video
+        words += [] if self.granularity == "terms" else [f"by {self.granularity}"]
+        arguments = [*self.method_args.items(), *self.backbone_args.items()]
+        return " ".join([*words, *(f"{key}={value}" for key, value in arguments)])
+
 
 # --- identity -----------------------------------------------------------------------------------
 
@@ -162,13 +172,25 @@ def override(cell: Cell, settings: Iterable[str]) -> Cell:
     Raises:
         ValueError: no `=`, an unknown key (with the nearest known one), or a value of another type.
     """
-    values = {}
+    return set_values(cell, parse_settings(settings))
+
+
+def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
+    """`key=value` strings as values of TOML, or as text where a value is none: `seed=3`.
+
+    Raises:
+        ValueError: no `=`.
+    """
+    values: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals:
             raise ValueError(f"'{setting}' is not key=value, such as recipe.optim.lr=3e-4")
-        values[key.strip()] = _parse(text.strip())
-    return set_values(cell, values)
+        try:
+            values[key.strip()] = tomllib.loads(f"value = {text.strip()}")["value"]
+        except tomllib.TOMLDecodeError:
+            values[key.strip()] = text.strip()
+    return values
 
 
 def set_values(cell: Cell, settings: Mapping[str, Any]) -> Cell:
@@ -189,11 +211,3 @@ def set_values(cell: Cell, settings: Mapping[str, Any]) -> Cell:
             raise ValueError(f"unknown key '{key}'{did_you_mean(last, target)}")
         target[last] = to_dict(value)
     return from_dict(Cell, values)
-
-
-def _parse(text: str) -> Any:
-    """A TOML value, or the text itself where it is not one: `lr=1e-3`, `dataset=cityscapes`."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text

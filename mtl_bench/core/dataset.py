@@ -141,6 +141,7 @@ class Dataset:
             "takes_further_labels",
             "recognises",
             "render",
+            "example",
             "check",
             "image_files",
             "sources",
@@ -181,6 +182,15 @@ class Dataset:
     def recognises(cls, root: Path) -> bool:
         """Whether a folder is in this data set's layout."""
         raise NotImplementedError
+
+    @classmethod
+    def example(cls, root: Path, data: Data) -> bool:
+        """Write a few frames of the splits train and val in this layout, for `mtl-bench check`.
+
+        Returns:
+            Whether it did: a data set may do without.
+        """
+        return False
 
     @classmethod
     def render(cls, data: Data, quiet: bool = False) -> Path:

@@ -10,14 +10,20 @@ from typing import Any, BinaryIO
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write, which appears under its name when the block ends, and not if it fails."""
+def replacing(path: Path, synced: bool = True) -> Iterator[BinaryIO]:
+    """A file to write, which appears under its name when the block ends, and not if it fails.
+
+    Args:
+        synced: wait until the disk has it, which takes milliseconds; for what can be made again
+            in no time, or is checked when it is read, that is not needed.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
     try:
         with temporary.open("wb") as file:
             yield file
-            file.flush()
-            os.fsync(file.fileno())
+            if synced:
+                file.flush()
+                os.fsync(file.fileno())
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

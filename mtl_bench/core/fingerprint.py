@@ -16,6 +16,7 @@ such ones use. Members that stand nowhere count for every stage.
 
 import ast
 import hashlib
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -35,11 +36,11 @@ EXCLUDED = {
         "core.columns",
         "core.quality",
         "core.files",
-        "core.quiet",
+        "core.locks",
         "train.progress",
         "train.tracking",
     ),
-    *("train.curve", "bench.claim", "bench.results", "cli", "report", "show"),
+    *("train.curve", "bench.jobs", "bench.store", "cli", "report", "show"),
 }
 MEMBERS = "stage_members"
 SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
@@ -99,9 +100,7 @@ def fingerprints(stage: str, roots: Iterable[Root]) -> dict[str, str]:
     Raises:
         ValueError: a file that is no Python, or a root that it does not define.
     """
-    if any(_stamp(path) != stamp for path, (stamp, _) in _modules.items()):  # edited since
-        _modules.clear()
-        _known.clear()
+    forget_edited()
     key = stage, tuple(roots)
     if key not in _known:
         _known[key] = _by_part(reach(*key), key[1])
@@ -171,19 +170,24 @@ def _classes(root: Root) -> list[str]:
     """The class of a plug-in file; all of them where none is seen to descend from the base."""
     module = load(root.path)
     names = [n for n, s in module.statements.items() if isinstance(s[-1], ast.ClassDef)]
-    heirs = [n for n in names if any(b.name == root.base for b in _bases(root.path, n))]
+    heirs = [n for n in names if root.base in [b for _, b in list(ancestry(root.path, n))[1:]]]
     return heirs or names
 
 
-def _bases(path: Path, name: str) -> Iterator[Target]:
-    """All classes of ours that a class descends from."""
-    for statement in load(path).statements.get(name, []):
-        if isinstance(statement, ast.ClassDef):
-            for base in statement.bases:
-                for target in _Normal(load(path)).targets_of(base):
-                    for file, found in _definitions(target):
-                        yield Target(file, found)
-                        yield from _bases(file, found)
+def ancestry(path: Path, name: str) -> dict[tuple[Path, str], ast.ClassDef]:
+    """A class and those of ours that it descends from, the nearest first, by file and name."""
+    found: dict[tuple[Path, str], ast.ClassDef] = {}
+    left = deque([(path, name)])
+    while left:
+        place = left.popleft()
+        module = load(place[0])
+        for statement in module.statements.get(place[1], []):
+            if isinstance(statement, ast.ClassDef) and place not in found:
+                found[place] = statement
+                for base in statement.bases:
+                    for target in _Normal(module).targets_of(base):
+                        left.extend(_definitions(target))
+    return found
 
 
 def _definitions(target: Target) -> Iterator[tuple[Path, str]]:
@@ -213,6 +217,13 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     except FileNotFoundError:
         return None
     return status.st_mtime_ns, status.st_size
+
+
+def forget_edited() -> None:
+    """Read all files anew if one of them was edited."""
+    if any(_stamp(path) != stamp for path, (stamp, _) in _modules.items()):
+        _modules.clear()
+        _known.clear()
 
 
 def load(path: Path) -> "Module":
@@ -297,11 +308,8 @@ class Module:
         if not isinstance(self.statements.get(name, [None])[-1], ast.ClassDef):
             return None
         found: dict[str, set[str]] | None = None
-        for target in [Target(self.path, name), *_bases(self.path, name)]:
-            assert target.path is not None
-            assert target.name is not None
-            statement = load(target.path).statements[target.name][-1]
-            for member in statement.body if isinstance(statement, ast.ClassDef) else []:
+        for statement in ancestry(self.path, name).values():
+            for member in statement.body:
                 value = getattr(member, "value", None)
                 if MEMBERS in bound(_same_scope([member])) and value is not None:
                     found = found or {}

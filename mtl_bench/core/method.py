@@ -1,27 +1,44 @@
 """What a weighting method may ask for and must answer.
 
-A method turns the unweighted losses of one step into one update. It is a file in `methods/` with
-one class, of one of two kinds:
+A method turns the unweighted losses of a step into one update. It is a file in `methods/` with one
+class, which declares in one word what it needs and has the function that gets it:
 
-- `LossMethod`: answers with one scalar, `total(loss_K)`. Its task weights are the scalar's
-  derivatives, so they are exact and nobody has to report them.
-- `GradientMethod`: sees the task gradients of what is shared and answers with weights or with a
-  direction. It never sees the network, the precision or the loss scale.
+    needs               of the losses                                          function
+    "losses"            their values                                           total
+    "gramian"           inner products of their gradients                      weights
+    "representation"    the same, of the gradients of what the decoders read   weights
+    "jacobian"          their gradients                                        direction
+
+A `LossMethod` needs values: its scalar's derivatives are its weights, so that these are exact and
+nobody has to report them. A `GradientMethod` needs one of the others, of what the tasks share. No
+method sees the network, the precision or the loss scale.
 
 Hyper-parameters are keyword arguments of the constructor. State is buffers and parameters, so that
 it travels in checkpoints; randomness comes from `self.generator`, which does too.
 
-Shapes: T losses of the cell, K losses of this batch (a batch may lack a task's labels; nearly
+Shapes: T losses of the cell, K losses of this step (a batch may lack a task's labels; nearly
 always K = T), P shared parameters, flattened.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from mtl_bench.core.terms import Term
+
+Needs = Literal["losses", "gramian", "representation", "jacobian"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The losses of one step. A method with state of every term reads `state_T[step.present]`."""
+
+    loss_K: Tensor
+    present: Tensor  # [K]: which of the T terms they are
 
 
 class Method(nn.Module):
@@ -33,20 +50,26 @@ class Method(nn.Module):
         seed: start of `self.generator`.
     """
 
-    fixed_T: Tensor
+    needs: Needs
     batches = 1  # independent batches a step
     reevaluates = False  # True: `after_step` gets the batch's losses under the new parameters
+    space: Mapping[str, Any] = MappingProxyType({})  # hyper-parameters to tune, and their values
+    fixed_T: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0):
         super().__init__()
         self.terms = tuple(terms)
-        self.present = torch.arange(len(terms))  # which of T the K are: state_T[self.present]
         self.generator = torch.Generator().manual_seed(seed)
         fixed = torch.tensor([term.fixed_weight for term in terms])
         self.register_buffer("fixed_T", fixed, persistent=False)
 
-    def after_step(self, before_K: Tensor, after_K: Tensor) -> None:
-        """The same batch's losses before and after the optimiser's step, detached."""
+    def after_step(self, step: Step, after_K: Tensor) -> None:
+        """Learn from what the update did.
+
+        Args:
+            step: the step, whose losses are those before the update.
+            after_K: the same batch's losses after it.
+        """
         raise NotImplementedError
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -62,7 +85,9 @@ class Method(nn.Module):
 class LossMethod(Method):
     """A method that needs loss values only: one ordinary backward pass."""
 
-    def total(self, loss_K: Tensor) -> Tensor:
+    needs: Needs = "losses"
+
+    def total(self, step: Step) -> Tensor:
         """The scalar to minimise, differentiable in the losses and in the method's parameters."""
         raise NotImplementedError
 
@@ -70,35 +95,31 @@ class LossMethod(Method):
 class GradientMethod(Method):
     """A method that needs every loss's gradient: K backward passes through what is shared.
 
-    Override `weights` (the common case) or `direction`.
+    With needs = "representation" these end at what the decoders read; one goes on into the encoder.
     """
 
-    weighted_heads = False  # True: decoders, heads and pose are trained with the weights too
-    # Of the gradients: "parameters", the shared ones; or "representation", what the decoders read:
-    # then K backward passes end there, and one goes on into the encoder.
-    space = "parameters"
+    needs: Needs = "gramian"
+    weighted_heads = False  # True: decoders, heads and pose are trained with `head_weights`
 
-    def weights(self, G_KK: Tensor, loss_K: Tensor) -> Tensor:
-        """Weights [K] of the task gradients.
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        """Weights [K] of the gradients.
 
         Args:
-            G_KK: their Gramian J J^T, float64 on the CPU.
-            loss_K: the losses, float64 on the CPU.
+            G_KK: their Gramian J J^T; float64 on the CPU, as the step's losses.
         """
         raise NotImplementedError
 
-    def direction(self, J_KP: Tensor, loss_K: Tensor) -> tuple[Tensor, Tensor]:
-        """Update direction [P] of the shared parameters, and the weights [K] to log.
+    def direction(self, J_KP: Tensor, step: Step) -> tuple[Tensor, Tensor]:
+        """Update direction [P] of the shared parameters, and the weights [K] to log."""
+        raise NotImplementedError
 
-        Where a method does not override this, the same comes about without the matrix J.
+    def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
+        """Weights [K] of the losses for the parameters that are not shared.
+
+        Args:
+            weight_K: those of the gradients.
         """
-        G_KK = (J_KP @ J_KP.T).double().cpu()
-        weight_K = self.weights(G_KK, loss_K.double().cpu()).to(J_KP)
-        return weight_K @ J_KP, weight_K
-
-    def head_weights(self, weight_K: Tensor, loss_K: Tensor) -> Tensor:
-        """Weights [K] of each loss for the parameters that are not shared."""
-        return weight_K if self.weighted_heads else torch.ones_like(weight_K)
+        return weight_K
 
 
 class CrossMethod(GradientMethod):
@@ -106,27 +127,22 @@ class CrossMethod(GradientMethod):
 
     Of independent batches, J_1 J_2^T estimates the Gramian of the expected gradients without bias;
     J_1 J_1^T would not. The third batch needs no gradients of single losses for what is shared.
-    Override `weights`, whose G_KK is J_1 J_2^T here and whose losses are the two batches' mean.
+    `weights` gets J_1 J_2^T as its G_KK, and the two batches' mean losses.
     """
 
     batches = 3
-
-    def direction(self, J_NKP: Tensor, loss_NK: Tensor) -> tuple[Tensor, Tensor]:
-        """What the three batches' gradients J_1, J_2, J_3 lead to."""
-        A_KK = (J_NKP[0] @ J_NKP[1].T).double().cpu()
-        weight_K = self.weights(A_KK, loss_NK[:2].mean(0).double().cpu()).to(J_NKP)
-        return weight_K @ J_NKP[2], weight_K
 
 
 class LookAheadMethod(GradientMethod):
     """A gradient method that asks how other losses react to its update before it is made."""
 
+    needs = "jacobian"
     batches = 2  # one to train on, one to look at
 
     def direction_ahead(
-        self, J_KP: Tensor, loss_K: Tensor, ahead: Callable[[Tensor], Tensor], lr: float
+        self, J_KP: Tensor, step: Step, ahead: Callable[[Tensor], Tensor], lr: float
     ) -> tuple[Tensor, Tensor]:
-        """Update direction [P] and weights [K].
+        """Update direction [P] and weights [K], in the place of `direction`.
 
         Args:
             ahead: takes a direction [P], moves the shared parameters by -lr times it, and returns
@@ -139,16 +155,19 @@ class LookAheadMethod(GradientMethod):
 class Composed(Method):
     """A loss-value method first, a gradient method on the losses as it weighs them: `a+b`.
 
-    The rows that the gradient method sees are scaled by the first method's weights; what is not
-    shared is trained with those weights times the gradient method's own.
+    The gradients that the gradient method sees are scaled by the first method's weights; what is
+    not shared is trained with those weights times the gradient method's own.
     """
+
+    needs: Needs = "gramian"
 
     def __init__(self, loss: LossMethod, gradient: GradientMethod):
         super().__init__(loss.terms)
         self.loss = loss
         self.gradient = gradient
+        self.needs = gradient.needs
         self.batches = gradient.batches
         self.reevaluates = loss.reevaluates  # a gradient method has its gradients to learn from
 
-    def after_step(self, before_K: Tensor, after_K: Tensor) -> None:
-        self.loss.after_step(before_K, after_K)
+    def after_step(self, step: Step, after_K: Tensor) -> None:
+        self.loss.after_step(step, after_K)

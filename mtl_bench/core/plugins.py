@@ -28,6 +28,8 @@ from pathlib import Path
 from typing import Any
 
 from mtl_bench.core.config import Cell, did_you_mean
+from mtl_bench.core.fingerprint import ancestry, of_package
+from mtl_bench.core.fingerprint import load as load_text
 
 PACKAGE = Path(__file__).resolve().parents[1]
 VARIABLE = "MTL_BENCH_PLUGINS"  # what --plugins adds to; the processes that run cells inherit it
@@ -138,7 +140,7 @@ def _kind_of(path: Path) -> str | None:
     folder = path.parent.parent if path.stem == "__init__" else path.parent
     for kind, place in SHIPPED.items():
         if folder == place:  # other modules lie beside the plug-ins
-            return kind if path in _derived(folder, BASES[kind][1]) else None
+            return kind if _derives(path, kind) else None
     if folder.name in KINDS:
         return folder.name
     text = path.read_text(encoding="utf-8", errors="replace")
@@ -153,23 +155,12 @@ def _kind_of(path: Path) -> str | None:
 
 
 @functools.cache
-def _derived(folder: Path, base: str) -> set[Path]:
-    """Files of a shipped folder that define a public class whose bases lead, through the folder, to
-    one of this name or whose name ends with it."""
-    classes = [
-        (node.name, {ast.unparse(base).rpartition(".")[2] for base in node.bases}, path)
-        for path in _files_in(folder)
-        for node in _parse(path.read_bytes()).body
-        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
-    ]
-    names, found, size = {base, f"Graph{base}"}, set[Path](), -1
-    while len(found) > size:  # a class may come before its base
-        size = len(found)
-        for name, bases, path in classes:
-            if bases & names:
-                names.add(name)
-                found.add(path)
-    return found
+def _derives(path: Path, kind: str) -> bool:
+    """Whether a file of this package defines a class that descends from a kind's contract."""
+    module, base = BASES[kind]
+    contract = of_package(module.removeprefix("mtl_bench.")), base
+    public = (name for name in load_text(path).statements if not name.startswith("_"))
+    return any(contract in ancestry(path, name) for name in public)
 
 
 @functools.cache
@@ -267,13 +258,40 @@ def _assigned(text: bytes) -> Iterator[tuple[str, ast.expr]]:
             yield from ((ast.unparse(target), item.value) for target in targets if target)
 
 
+def bases(kind: str, text: bytes) -> list[str]:
+    """Names of the shipped plug-ins that a file's classes derive from."""
+    package = ".".join(("mtl_bench", *SHIPPED[kind].relative_to(PACKAGE).parts))
+    tree = _parse(text)
+    derived = {
+        ast.unparse(base)
+        for node in tree.body
+        if isinstance(node, ast.ClassDef)
+        for base in node.bases
+    }
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
+    return [
+        str(node.module).removeprefix(f"{package}.")
+        for node in imports
+        if str(node.module).rpartition(".")[0] == package
+        and any((alias.asname or alias.name) in derived for alias in node.names)
+    ]
+
+
+def family(task: str) -> set[str]:
+    """A task and those that it derives from."""
+    found = {task}
+    for base in bases("tasks", path_of("tasks", task).read_bytes()):
+        found |= family(base)
+    return found
+
+
 def ordered(tasks: Iterable[str]) -> list[str]:
     """Names of tasks, each behind those whose results it reads, else by the alphabet.
 
     Raises:
         ValueError: an unknown task, or tasks that wait for each other.
     """
-    after = {name: set(attributes("tasks", name).get("after", ())) for name in sorted(tasks)}
+    after = {name: _after(name) for name in sorted(tasks)}
     found: list[str] = []
     while len(found) < len(after):
         ready = [n for n in after if n not in found and after[n] & after.keys() <= set(found)]
@@ -281,6 +299,12 @@ def ordered(tasks: Iterable[str]) -> list[str]:
             raise ValueError(f"tasks wait for each other: {', '.join(after.keys() - set(found))}")
         found.append(ready[0])
     return found
+
+
+def _after(task: str) -> set[str]:
+    """Tasks whose results a task reads; an heir's are those of the task that it derives from."""
+    found = [attributes("tasks", name).get("after") for name in family(task)]
+    return set().union(*filter(None, found))
 
 
 def lack(packages: Iterable[str], extra: Iterable[str]) -> str | None:

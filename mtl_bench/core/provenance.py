@@ -45,8 +45,8 @@ def code(cell: Cell) -> Code:
 
 def roots(cell: Cell) -> dict[str, list[Root]]:
     """Where the code of each stage begins; a video cell has the stage "label", too."""
-    tasks = [_root("tasks", name) for name in cell.tasks]
-    dataset = _root("datasets", cell.recipe.data.dataset.replace("-", "_"))
+    tasks = [plugin_root("tasks", name) for name in cell.tasks]
+    dataset = plugin_root("datasets", cell.recipe.data.dataset.replace("-", "_"))
     methods = [
         Root(plugins.path_of("methods", name), part="method", base="Method")
         for name in plugins.part_names(cell.method)
@@ -63,7 +63,7 @@ def backbone_root(name: str) -> Root:
     return Root(plugins.path_of("backbones", name), part="backbone", base="Backbone")
 
 
-def _root(kind: str, name: str) -> Root:
+def plugin_root(kind: str, name: str) -> Root:
     """Of a plug-in that may be this package's own."""
     path, base = plugins.path_of(kind, name), plugins.BASES[kind][1]
     return Root(path, part=HARNESS if ours(path) else f"{kind}/{name}.py", base=base)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mtl_bench.core import config
+from mtl_bench.core.files import replacing
 from mtl_bench.data import cityscapes_files as files
 
 PLACE = "MTL_BENCH_FRAME_CACHE"
@@ -108,14 +109,9 @@ class FrameCache:
         }
         out = self._file(path)
         out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-        try:
-            with temporary.open("wb") as file:
-                file.write(json.dumps(values).encode().ljust(_HEADER_BYTES))
-                file.write(pixels.data)
-            temporary.replace(out)
-        finally:
-            temporary.unlink(missing_ok=True)
+        with replacing(out, synced=False) as file:
+            file.write(json.dumps(values).encode().ljust(_HEADER_BYTES))
+            file.write(pixels.data)
 
     def lacks(self, path: Path) -> bool:
         """Whether a file has to be decoded into the cache: it is absent, old or damaged."""

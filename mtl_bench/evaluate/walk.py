@@ -171,7 +171,7 @@ def measure(
                 picture: Picture = {"names": name}
                 for task, metric in walk.measured:
                     seen = metric.update(
-                        frame_truth(task, batch, slot), _frame(found[task.name], slot)
+                        frame_truth(task, batch, slot), frame_of(found[task.name], slot)
                     )
                     picture = {**seen, **picture}
                 if main:
@@ -194,7 +194,8 @@ def frame_truth(task: Task, batch: Batch, slot: int) -> dict[str, NDArray[Any]]:
     }
 
 
-def _frame(results: Results, slot: int) -> dict[str, NDArray[Any]]:
+def frame_of(results: Results, slot: int) -> dict[str, NDArray[Any]]:
+    """One frame's results."""
     return {name: value[slot].cpu().numpy() for name, value in results.items()}
 
 
@@ -309,7 +310,7 @@ def _stacked(pictures: list[Picture]) -> dict[str, Any]:
     }
 
 
-def _of_one_size(pictures: list[NDArray]) -> list[NDArray]:
+def _of_one_size(pictures: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """All at the first one's size: frames may differ by some pixels, a report's must not."""
     height, width = pictures[0].shape[:2]
     rows, columns = np.arange(height)[:, None], np.arange(width)

@@ -12,6 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mtl_bench.core.recipe import Network
+from mtl_bench.core.task import Maps, TaskHead
+
 LEAK = 0.01  # LeakyReLU slope of the paper's InPlaceABN
 
 
@@ -34,7 +37,8 @@ class GlobalContext(nn.Module):
         self.conv = ConvNorm(inputs, outputs, 1)
 
     def forward(self, deepest_BCHW: Tensor) -> Tensor:
-        return self.conv(deepest_BCHW.mean((2, 3), keepdim=True))
+        found: Tensor = self.conv(deepest_BCHW.mean((2, 3), keepdim=True))
+        return found
 
 
 class AttentionRefinement(nn.Module):
@@ -47,7 +51,8 @@ class AttentionRefinement(nn.Module):
 
     def forward(self, x_BCHW: Tensor) -> Tensor:
         features = self.conv(x_BCHW)
-        return features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        found: Tensor = features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        return found
 
 
 class FeatureFusion(nn.Module):
@@ -64,7 +69,10 @@ class FeatureFusion(nn.Module):
 
     def forward(self, skip_BCHW: Tensor, deep_BCHW: Tensor) -> Tensor:
         features = self.conv(torch.cat([skip_BCHW, deep_BCHW], 1))
-        return features + features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        found: Tensor = (
+            features + features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        )
+        return found
 
 
 class Decoder(nn.Module):
@@ -100,6 +108,28 @@ class Head(nn.Sequential):
 
     def __init__(self, inputs: int, hidden: int, outputs: int):
         super().__init__(ConvNorm(inputs, hidden, 3), nn.Conv2d(hidden, outputs, 1, bias=False))
+
+
+class DenseHead(TaskHead):
+    """One decoder and one head: a raw map of some channels at the finest stride.
+
+    Args:
+        name: of the task; its map has it, too.
+        inputs: channels of the features, finest first.
+        outputs: channels of the map.
+    """
+
+    def __init__(self, name: str, inputs: tuple[int, ...], sizes: Network, outputs: int):
+        super().__init__()
+        self.name = name
+        self.decoders = nn.ModuleDict({name: Decoder(inputs, sizes.channels, sizes.fused)})
+        self.heads = nn.ModuleDict({name: Head(sizes.fused, sizes.head, outputs)})
+
+    def forward(
+        self, pyramid: Sequence[Tensor], context_BC11: Tensor, auxiliary: bool = False
+    ) -> Maps:
+        features_BChw = self.decoders[self.name](pyramid, context_BC11)[0]
+        return {self.name: self.heads[self.name](features_BChw)}
 
 
 def init_fan_in(module: nn.Module) -> None:

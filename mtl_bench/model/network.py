@@ -4,8 +4,9 @@ Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021), section 3.1 and figure 2
 Shapes: B images, C channels, H x W input pixels, h x w cells of the finest stride.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -53,6 +54,22 @@ class Network(nn.Module):
                     )
                 ours.update(dict(own.items()))
             self._parts[task.name] = part
+
+    def keep(self, names: Collection[str]) -> None:
+        """Drop the decoders and heads of other tasks."""
+        for task in [task for task in self.tasks if task.name not in names]:
+            part = self._parts.pop(task.name)
+            for own, ours in ((part.decoders, self.decoders), (part.heads, self.heads)):
+                for name in own:
+                    del ours[name]
+        self.tasks = tuple(task for task in self.tasks if task.name in names)
+
+    def like_trained(self, image_B3HW: Tensor) -> None:
+        """Give random weights what the time of post-processing depends on, by this image."""
+        with torch.no_grad():
+            maps = self(image_B3HW).maps
+        for task in self.tasks:
+            task.like_trained(self._parts[task.name], maps[task.name])
 
     def features(self, normalized_B3HW: Tensor) -> tuple[list[Tensor], Tensor]:
         """What decoders read of a normalised image: the pyramid, finest first, and the context."""
@@ -107,6 +124,17 @@ class Model(nn.Module):
         self.tasks = tuple(tasks)
         self._extra: dict[str, dict[str, nn.Module]] = {}
         self._extra_names: list[str] = []
+
+    def keep(self, names: Collection[str]) -> None:
+        """Leave only these tasks."""
+        if isinstance(self.net, SideBySide):
+            nets: list[Any] = list(self.net.networks)
+            for net in nets:
+                net.keep(names)
+            self.net.networks = nn.ModuleList(net for net in nets if net.tasks)
+        elif isinstance(self.net, Network):
+            self.net.keep(names)
+        self.tasks = tuple(task for task in self.tasks if task.name in names)
 
     def add_extra(self, task: Task, modules: dict[str, nn.Module]) -> None:
         """Networks that a task trains with; they are the model's under their own names."""

@@ -3,37 +3,78 @@
 After `backward`, every parameter's `.grad` holds what the optimiser should see, and the method's
 own parameters have theirs. A loss-value method costs one ordinary backward pass. A gradient method
 costs one per loss: each goes through its decoder, stops at what the decoders read, and from there
-goes on into the encoder. In the space of the representation it does not: one weighted pass does.
+goes on into the encoder. A method that needs gradients of the representation stops there: one
+weighted pass goes on. A method that needs no more than a Gramian gets that, and no matrix is made.
 
 Works under autocast; `scale` is the loss scale of fp16 training and is invisible to the method. A
 batch may come in parts: a method sees the mean of their losses and gradients, so that parts change
 what is in memory and not what a method decides.
 
-Shapes: K losses of this batch, N independent batches, P numbers in the method's space.
+Shapes: T losses of the method, K of them in this batch, N independent batches, P shared parameters.
 """
 
+import contextlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from mtl_bench.core.method import Composed, CrossMethod, GradientMethod, LossMethod, Method
-from mtl_bench.core.terms import gather
-from mtl_bench.train.by_gradients import cross_backwards, task_backwards
-from mtl_bench.train.gradients import (
-    Forward,
-    Pass,
-    Split,
-    losses_of,
-    mean_losses,
-    onward,
-    stack_losses,
-    trainable,
+from mtl_bench.core.method import (
+    Composed,
+    CrossMethod,
+    GradientMethod,
+    LookAheadMethod,
+    LossMethod,
+    Method,
+    Step,
 )
-from mtl_bench.train.weighting import Weighting, cosines_of, differentiate, names_of, weighting
+from mtl_bench.core.terms import gather
+from mtl_bench.train.gramian import (
+    KINDS,
+    Gradient,
+    Gradients,
+    Matrix,
+    add,
+    combine,
+    cosines_of,
+    divided,
+    onward,
+    products,
+    unflatten,
+)
 
-__all__ = ["Forward", "Pass", "Weighting", "backward", "losses_now"]
+
+@dataclass(frozen=True)
+class Pass:
+    """What one forward pass leaves behind."""
+
+    losses: Mapping[str, Tensor]  # unweighted loss terms, less those without labels in the batch
+    representation: Sequence[Tensor]  # what decoders read; shared parameters act only through it
+
+
+Forward = Callable[[], Pass]  # sends one part of a batch through the model
+
+
+class Split(Protocol):
+    """A model that says which parameters all tasks train and which only one of them."""
+
+    def shared_parameters(self) -> Iterator[nn.Parameter]: ...
+    def task_parameters(self) -> Iterator[nn.Parameter]: ...
+    def modules(self) -> Iterator[nn.Module]: ...
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """What the method saw and decided, for the log."""
+
+    total: float  # the scalar minimised; for gradient methods the weighted sum of the losses
+    step: Step
+    losses: dict[str, float]  # the loss terms
+    weights: dict[str, float]  # derivative of the update with respect to each loss of the method
+    cosines: dict[str, float] = field(default_factory=dict)  # of pairs of task gradients: "a.b"
 
 
 def backward(
@@ -55,55 +96,359 @@ def backward(
             at the cost of one backward pass per loss).
     """
     if isinstance(method, LossMethod):
-        return _one_backward(method, batches[0], model, scale, cosines)
+        return _by_losses(method, batches[0], model, scale, cosines)
     first, second = (
         (method.loss, method.gradient) if isinstance(method, Composed) else (None, method)
     )
     assert isinstance(second, GradientMethod)
+    step = _ByGradients(first, second, model, scale)
     if isinstance(second, CrossMethod):
-        return cross_backwards(first, second, batches, model, scale, cosines)
-    return task_backwards(first, second, batches, model, scale, lr, cosines)
+        return step.on_three_batches(batches, cosines)
+    return step.on_one_batch(batches, lr, cosines)
+
+
+def reevaluate(method: Method, step: Step, parts: Sequence[Forward], model: Split) -> None:
+    """Tell a method that asks for it what the batch's losses are after its step."""
+    method.after_step(step, step_of(method, losses_now(parts, model)).loss_K)
 
 
 def losses_now(parts: Sequence[Forward], model: Split) -> dict[str, Tensor]:
     """A batch's loss terms under the present parameters; leaves no trace in the model."""
-    return mean_losses(losses_of(parts, model))
+    return mean_losses(_losses_of(parts, model))
+
+
+# --- losses ---------------------------------------------------------------------------------------
+
+
+def step_of(method: Method, losses: Mapping[str, Tensor]) -> Step:
+    """What the method sees of a batch's loss terms, in its own order.
+
+    Raises:
+        ValueError: there are none.
+    """
+    mine = gather(losses, method.terms)
+    if not mine:
+        raise ValueError("a batch without labels for any of the cell's tasks: nothing to train on")
+    present = torch.tensor([i for i, term in enumerate(method.terms) if term.name in mine])
+    return Step(torch.stack(list(mine.values())), present)
+
+
+def mean_losses(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Each loss's mean over the parts of a batch that have it, detached."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    found = {
+        name: [part[name].detach().float() for part in parts if name in part] for name in names
+    }
+    return {name: torch.stack(values).mean(0) for name, values in found.items()}
+
+
+def _losses_of(parts: Sequence[Forward], model: Split) -> list[Mapping[str, Tensor]]:
+    """Each part's loss terms under the present parameters; leaves no trace in the model."""
+    with torch.no_grad(), frozen_statistics(model):
+        return [part().losses for part in parts]
+
+
+def _looked_at(
+    method: Method, parts: Sequence[Forward], model: Split
+) -> tuple[dict[str, Tensor], Counter[str], Iterator[Pass]]:
+    """A batch's mean losses, in how many parts the method has each, and then its passes.
+
+    Weights may depend on all losses, so a batch in several parts is run twice: for its losses, and
+    for its gradients once the weights are known.
+    """
+    single = [parts[0]()] if len(parts) == 1 else []
+    seen = [passed.losses for passed in single] or _losses_of(parts, model)
+    count = Counter(name for losses in seen for name in gather(losses, method.terms))
+    return mean_losses(seen), count, (single.pop() if single else part() for part in parts)
+
+
+def _names_of(method: Method, step: Step) -> list[str]:
+    return [method.terms[index].name for index in step.present.tolist()]
+
+
+def _weighting(
+    method: Method,
+    losses: Mapping[str, Tensor],
+    step: Step,
+    weight_K: Tensor,
+    cosines: dict[str, float],
+    total: float | None = None,
+) -> Weighting:
+    """Tensors as the log has them; the total is the weighted sum where it is not said."""
+    total = float(weight_K @ step.loss_K) if total is None else total
+    floats = {name: loss.item() for name, loss in losses.items()}
+    weights = dict(zip(_names_of(method, step), weight_K.tolist(), strict=True))
+    return Weighting(total, step, floats, weights, cosines)
 
 
 # --- loss-value methods ---------------------------------------------------------------------------
 
 
-def _one_backward(
+def _by_losses(
     method: LossMethod, parts: Sequence[Forward], model: Split, scale: float, cosines: bool
 ) -> Weighting:
-    """The weights are the derivatives of the method's scalar.
-
-    They may depend on all losses, so a batch in parts is run twice: for its losses, and for its
-    gradients once the weights are known.
-    """
-    single = parts[0]() if len(parts) == 1 else None
-    seen = [single.losses] if single else losses_of(parts, model)
-    losses = mean_losses(seen)
-    loss_K = stack_losses(method, losses)
-    total, scaled_K = differentiate(method, loss_K, scale)
+    """The weights are the derivatives of the method's scalar."""
+    losses, count, passes = _looked_at(method, parts, model)
+    step = step_of(method, losses)
+    total, scaled_K = _differentiate(method, step, scale)
     cosine_of: dict[str, float] = {}
-    scaled = dict(zip(names_of(method), scaled_K, strict=True))
-    count = Counter(name for losses in seen for name in gather(losses, method.terms))
-    for number, part in enumerate(parts):
-        passed = single or part()
-        if cosines and number == 0:
-            cosine_of = _cosines_of(method, passed, model)
+    scaled = dict(zip(_names_of(method, step), scaled_K, strict=True))
+    for number, passed in enumerate(passes):
         mine = gather(passed.losses, method.terms)
+        if cosines and number == 0:
+            cosine_of = _measured(mine, list(passed.representation), model)
         grads = [scaled[name] / count[name] for name in mine]
         torch.autograd.backward(list(mine.values()), grads)
-    return weighting(method, losses, loss_K, scaled_K / scale, cosine_of, total)
+    return _weighting(method, losses, step, scaled_K / scale, cosine_of, total)
 
 
-def _cosines_of(method: LossMethod, passed: Pass, model: Split) -> dict[str, float]:
-    shared, z = trainable(model.shared_parameters()), list(passed.representation)
-    mine = gather(passed.losses, method.terms)
-    rows = []
-    for value in mine.values():
-        z_grads = torch.autograd.grad(value, z, retain_graph=True, allow_unused=True)
-        rows.append(onward(z, z_grads, shared, True))
-    return cosines_of(list(mine), rows)
+def _differentiate(method: LossMethod, step: Step, scale: float) -> tuple[float, Tensor]:
+    """The method's scalar and `scale` times its derivatives; its own parameters get theirs, too."""
+    leaf_K = step.loss_K.clone().requires_grad_()
+    total = method.total(replace(step, loss_K=leaf_K))
+    (total * scale).backward()
+    assert leaf_K.grad is not None
+    return total.item(), leaf_K.grad
+
+
+def _measured(losses: Mapping[str, Tensor], z: list[Tensor], model: Split) -> dict[str, float]:
+    """Cosines of the losses' gradients, whose graph stays."""
+    shared, rows = trainable(model.shared_parameters()), []
+    for loss in losses.values():
+        z_grads = torch.autograd.grad(loss, z, retain_graph=True, allow_unused=True)
+        rows.append(onward(z, z_grads, shared, keep=True))
+    return cosines_of(list(losses), rows)
+
+
+# --- gradient methods -----------------------------------------------------------------------------
+
+
+@dataclass
+class _Seen:
+    """Of one batch: what a method sees, and what belongs to one task only."""
+
+    losses: dict[str, Tensor]
+    step: Step
+    names: list[str]  # of the step's losses
+    rows: list[list[Tensor | None]]  # K gradients
+    gradients: Gradients  # where they are from
+    own: dict[str, list[Tensor | None]]
+
+
+class _ByGradients:
+    """A gradient method's step, behind a loss-value method where two are composed."""
+
+    def __init__(
+        self, first: LossMethod | None, method: GradientMethod, model: Split, scale: float
+    ):
+        self.first, self.method, self.model, self.scale = first, method, model, scale
+        self.terms = [term.name for term in method.terms]
+        self.shared = trainable(model.shared_parameters())
+        self.own = trainable(model.task_parameters())
+
+    def on_one_batch(
+        self, batches: Sequence[Sequence[Forward]], lr: float, cosines: bool
+    ) -> Weighting:
+        """Every loss's gradient, then the method's answer."""
+        seen = self._differentiated(batches[0], self.scale, self.own)
+        first_K, step = self._first(seen.step)
+        measured = cosines_of(seen.names, seen.rows) if cosines else {}
+        if isinstance(seen.gradients, Matrix):
+            J_KP = seen.gradients.J_KP
+            if self.first is not None:
+                J_KP *= first_K[:, None]
+            direction_P, weight_K = self._direction(J_KP, first_K, step, batches, lr)
+            seen.gradients.back(unflatten(direction_P * self.scale, self.shared))
+        else:
+            weight_K = self._weights(products(seen.rows, seen.rows), first_K, step)
+            seen.gradients.back(combine(first_K * weight_K * self.scale, seen.rows))
+        self._add_own(seen.own, seen.names, first_K * self._head_weights(weight_K, step))
+        return _weighting(self.method, seen.losses, seen.step, first_K * weight_K, measured)
+
+    def on_three_batches(self, batches: Sequence[Sequence[Forward]], cosines: bool) -> Weighting:
+        """Gradients of two batches for the weights, one weighted pass of a third for the update.
+
+        Raises:
+            ValueError: the two batches have no loss in common.
+        """
+        seen = [self._differentiated(parts, self.scale, []) for parts in batches[:2]]
+        names = [name for name in seen[0].names if name in seen[1].names]
+        if not names:
+            name = type(self.method).__name__
+            raise ValueError(f"{name} compares batches, and they share no labels")
+        places = [[one.names.index(name) for name in names] for one in seen]
+        rows = [[one.rows[i] for i in place] for one, place in zip(seen, places, strict=True)]
+        loss_K, other_K = (one.step.loss_K[place] for one, place in zip(seen, places, strict=True))
+        plain = Step((loss_K + other_K) / 2, seen[0].step.present[places[0]])
+        first_K, step = self._first(plain)
+        measured = cosines_of(names, rows[0]) if cosines else {}
+        weight_K = self._weights(products(*rows), first_K, step)
+        head_K = first_K * self._head_weights(weight_K, step)
+        del seen, rows  # as large as the network, many times
+        losses = self._weighted_pass(batches[2], names, first_K * weight_K, head_K)
+        return _weighting(self.method, losses, plain, first_K * weight_K, measured)
+
+    def _first(self, step: Step) -> tuple[Tensor, Step]:
+        """A composition's loss-value method is asked first: its weights, and the step by them."""
+        if self.first is None:
+            return torch.ones_like(step.loss_K), step
+        first_K = _differentiate(self.first, step, self.scale)[1] / self.scale
+        return first_K, replace(step, loss_K=first_K * step.loss_K)
+
+    def _weights(self, G_KK: Tensor, first_K: Tensor, step: Step) -> Tensor:
+        """The method's weights [K]; ones where fp16 has overflowed, which no state may learn."""
+        if not torch.isfinite(G_KK).all():
+            return torch.ones_like(step.loss_K)
+        scale_K = first_K.double().cpu()
+        exact = replace(step, loss_K=step.loss_K.double().cpu())
+        return self.method.weights(G_KK * scale_K * scale_K[:, None], exact).to(step.loss_K)
+
+    def _direction(
+        self,
+        J_KP: Tensor,
+        first_K: Tensor,
+        step: Step,
+        batches: Sequence[Sequence[Forward]],
+        lr: float,
+    ) -> tuple[Tensor, Tensor]:
+        """The method's direction [P] and weights [K]; the sum where fp16 has overflowed."""
+        if not torch.isfinite(J_KP.sum()):
+            return J_KP.sum(0), torch.ones_like(step.loss_K)
+        if not isinstance(self.method, LookAheadMethod):
+            return self.method.direction(J_KP, step)
+        first_T = first_K.new_ones(len(self.terms))
+        first_T[step.present] = first_K
+
+        def ahead(direction_P: Tensor) -> Tensor:
+            """The second batch's gradients where a direction leads; the way back is taken, too."""
+            before = [parameter.detach().clone() for parameter in self.shared]
+            with torch.no_grad():
+                for parameter, move in zip(
+                    self.shared, unflatten(direction_P, self.shared), strict=True
+                ):
+                    parameter.sub_(lr * move)
+            with frozen_statistics(self.model):
+                seen = self._differentiated(batches[1], 1.0, [])
+            with torch.no_grad():
+                for parameter, value in zip(self.shared, before, strict=True):
+                    parameter.copy_(value)
+            assert isinstance(seen.gradients, Matrix)
+            ahead_KP = seen.gradients.J_KP * first_T[seen.step.present][:, None]
+            return ahead_KP.nan_to_num(0.0, 0.0, 0.0)  # an overflow there says nothing
+
+        return self.method.direction_ahead(J_KP, step, ahead, lr)
+
+    def _head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
+        if not self.method.weighted_heads:
+            return torch.ones_like(weight_K)
+        return self.method.head_weights(weight_K, step)
+
+    def _differentiated(
+        self, parts: Sequence[Forward], scale: float, own: Sequence[nn.Parameter]
+    ) -> _Seen:
+        """Each loss's gradient, averaged over the parts of the batch that have the loss.
+
+        Args:
+            scale: of the losses before they are differentiated; the method's gradients are free of
+                it, those of `own` are not.
+            own: parameters that are not shared, whose gradients are wanted.
+        """
+        gradients = KINDS[self.method.needs](self.shared, self.terms)
+        own_of: dict[str, list[Tensor | None]] = {}
+        count: Counter[str] = Counter()
+        looked_at = []
+        for part in parts:
+            passed = part()
+            looked_at.append({name: loss.detach() for name, loss in passed.losses.items()})
+            mine, z = gather(passed.losses, self.method.terms), list(passed.representation)
+            del passed  # which holds the losses, too
+            count.update(mine.keys())
+            gradients.add(z, _through_decoders(mine, z, own, own_of, scale))
+        losses = mean_losses(looked_at)
+        step = step_of(self.method, losses)
+        names = _names_of(self.method, step)
+        rows = gradients.mean({name: scale * count[name] for name in names})
+        means = {name: divided(own_of[name], count[name]) for name in names}
+        return _Seen(losses, step, names, rows, gradients, means)
+
+    def _weighted_pass(
+        self, parts: Sequence[Forward], names: Sequence[str], weight_K: Tensor, head_K: Tensor
+    ) -> dict[str, Tensor]:
+        """`.grad` of a batch whose losses count `weight` in what is shared, and `head` in the rest.
+
+        Losses without a name here are left out.
+        """
+        losses, count, passes = _looked_at(self.method, parts, self.model)
+        factors = [self.scale / max(count[name], 1) for name in names]
+        factor_K = torch.tensor(factors).to(weight_K)
+        own_of: dict[str, list[Tensor | None]] = {}
+        total: list[Tensor | None] = [None] * len(self.shared)
+        for passed in passes:
+            mine, z = gather(passed.losses, self.method.terms), list(passed.representation)
+            mine = {name: loss for name, loss in mine.items() if name in names}
+            del passed
+            z_grads = _through_decoders(mine, z, self.own, own_of, 1.0)
+            here = [names.index(name) for name in z_grads]
+            weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))
+            total = add(total, onward(z, weighted, self.shared, keep=False))
+        for parameter, grad in zip(self.shared, total, strict=True):
+            parameter.grad = grad
+        self._add_own(own_of, names, head_K * factor_K)
+        return losses
+
+    def _add_own(
+        self,
+        grads_of: Mapping[str, Sequence[Tensor | None]],
+        names: Sequence[str],
+        weight_K: Tensor,
+    ) -> None:
+        """Weighted gradients of what belongs to one task, into `.grad`."""
+        for name, weight in zip(names, weight_K, strict=True):
+            unit = weight == 1  # most often
+            for parameter, grad in zip(self.own, grads_of.get(name, ()), strict=False):
+                if grad is not None:
+                    grad = grad if unit else grad * weight.to(grad)
+                    parameter.grad = grad if parameter.grad is None else parameter.grad + grad
+
+
+def _through_decoders(
+    losses: dict[str, Tensor],
+    z: Sequence[Tensor],
+    own: Sequence[nn.Parameter],
+    own_of: dict[str, list[Tensor | None]],
+    scale: float,
+) -> dict[str, Gradient]:
+    """Gradients of what the decoders read, by loss; those of their parameters join `own_of`.
+
+    All decoders come before the encoder, whose own passes need memory, too: a loss that is done
+    with leaves `losses` and takes its decoder's activations along.
+    """
+    found: dict[str, Gradient] = {}
+    for name in list(losses):
+        loss = losses.pop(name) * scale
+        keep = len(losses) > 0  # they may share a decoder
+        grads = torch.autograd.grad(loss, [*z, *own], retain_graph=keep, allow_unused=True)
+        found[name] = grads[: len(z)]
+        own_of[name] = add(own_of.get(name), grads[len(z) :])
+    return found
+
+
+# --- the model ------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def frozen_statistics(model: Split) -> Iterator[None]:
+    """Training mode whose batch norms leave their running statistics alone."""
+    norms = [m for m in model.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
+    tracked = [m.track_running_stats for m in norms]
+    for norm in norms:
+        norm.track_running_stats = False
+    try:
+        yield
+    finally:
+        for norm, value in zip(norms, tracked, strict=True):
+            norm.track_running_stats = value
+
+
+def trainable(parameters: Iterator[nn.Parameter]) -> list[nn.Parameter]:
+    return [parameter for parameter in parameters if parameter.requires_grad]

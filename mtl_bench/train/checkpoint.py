@@ -4,13 +4,14 @@ Only tensors and plain values are stored, and only they are read back (`weights_
 stranger's checkpoint runs no code. The data position is the step itself (see `data/loader.py`).
 """
 
-import os
 import pickle
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
+
+from mtl_bench.core.files import replacing
 
 FORMAT = 1
 
@@ -23,7 +24,7 @@ def save(
     optimizer: torch.optim.Optimizer,
     scaler: torch.amp.GradScaler,
 ) -> None:
-    """Write to a temporary sibling and rename: a killed save leaves the previous checkpoint."""
+    """A killed save leaves the previous checkpoint."""
     state = {
         "format": FORMAT,
         "step": step,
@@ -34,12 +35,8 @@ def save(
         "rng": torch.get_rng_state(),
         "rng_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
     }
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
+    with replacing(path) as file:
         torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -1,11 +1,14 @@
 """The training curve: one CSV row per step, cut back to the checkpoint when a run resumes."""
 
 import csv
+import io
 import statistics
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
+
+from mtl_bench.core.files import write_text
 
 
 class Curve:
@@ -17,13 +20,12 @@ class Curve:
 
     def __init__(self, path: Path, resume_step: int = 0):
         kept = _rows_until(path, resume_step) if resume_step else []
-        temporary = path.with_name(path.name + ".tmp")
-        with temporary.open("w", newline="") as file:
-            if kept:
-                writer = csv.DictWriter(file, kept[0].keys())
-                writer.writeheader()
-                writer.writerows(kept)
-        temporary.replace(path)
+        text = io.StringIO(newline="")
+        if kept:
+            writer = csv.DictWriter(text, kept[0].keys())
+            writer.writeheader()
+            writer.writerows(kept)
+        write_text(path, text.getvalue())
         self._empty = not kept
         self._file = path.open("a", newline="")
 

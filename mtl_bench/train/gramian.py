@@ -3,14 +3,15 @@
 Most methods only need the Gramian and a weighted sum. Both can be had from the gradients as they
 are, without the time and the memory that a second copy of them takes.
 
-Shapes: K gradients, each a list of tensors (None where it is zero), P numbers in all.
+Shapes: T losses of a method, K of them with a gradient, each a list of tensors (None where it is
+zero), P numbers in all.
 """
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from itertools import combinations, pairwise
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 Gradient = Sequence[Tensor | None]  # in the order of the space's tensors
 CPU_CHUNK = 2**14  # numbers of a gradient at once: those of K gradients stay in a core's cache
@@ -60,7 +61,9 @@ def _weighted(weights: Sequence[float], column: Gradient) -> Tensor | None:
     return total
 
 
-def add(total: Gradient, grads: Gradient) -> list[Tensor | None]:
+def add(total: Gradient | None, grads: Gradient) -> list[Tensor | None]:
+    if total is None:
+        return list(grads)
     return [
         b if a is None else a if b is None else a + b for a, b in zip(total, grads, strict=True)
     ]
@@ -68,6 +71,15 @@ def add(total: Gradient, grads: Gradient) -> list[Tensor | None]:
 
 def divided(grads: Gradient, by: float) -> list[Tensor | None]:
     return list(grads) if by == 1 else [g if g is None else g / by for g in grads]
+
+
+def cosines_of(names: Sequence[str], rows: Sequence[Gradient]) -> dict[str, float]:
+    """Of every pair of gradients; 0 with one that is zero."""
+    G_KK = products(rows, rows)
+    norm_K = G_KK.diagonal().clamp_min(0).sqrt()
+    cosine_KK = G_KK / (norm_K * norm_K[:, None]).clamp_min(torch.finfo(torch.float64).tiny)
+    pairs = combinations(range(len(names)), 2)
+    return {f"{names[i]}.{names[j]}": float(cosine_KK[i, j]) for i, j in pairs}
 
 
 # --- as one vector --------------------------------------------------------------------------------
@@ -81,3 +93,84 @@ def flatten(grads: Gradient, like: Sequence[Tensor], out: Tensor | None = None) 
 def unflatten(vector_P: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
     parts = vector_P.split([x.numel() for x in like])
     return [part.view_as(x).to(x) for part, x in zip(parts, like, strict=True)]
+
+
+# --- collected over the parts of a batch ----------------------------------------------------------
+
+
+class Gradients:
+    """Gradients of the shared parameters, added up over the parts of a batch."""
+
+    def __init__(self, shared: Sequence[nn.Parameter], terms: Sequence[str]):
+        self.shared, self.terms = shared, terms
+        self.rows: dict[str, list[Tensor | None]] = {}
+
+    def add(self, z: Sequence[Tensor], z_grads: dict[str, Gradient]) -> None:
+        """A part's, from those of what the decoders read, which are used up."""
+        for name in list(z_grads):
+            grads = z_grads.pop(name)
+            self.put(name, onward(z, grads, self.shared, keep=len(z_grads) > 0))
+
+    def put(self, name: str, grads: Gradient) -> None:
+        self.rows[name] = add(self.rows.get(name), grads)
+
+    def mean(self, divisor_of: Mapping[str, float]) -> list[list[Tensor | None]]:
+        return [divided(self.rows[name], by) for name, by in divisor_of.items()]
+
+    def back(self, direction: Gradient) -> None:
+        """A direction, as a row has it, into `.grad`."""
+        for parameter, grad in zip(self.shared, direction, strict=True):
+            parameter.grad = grad
+
+
+class Matrix(Gradients):
+    """The same as one matrix, made row by row: a second copy may cost as much as the network."""
+
+    def put(self, name: str, grads: Gradient) -> None:
+        if not self.rows:  # not before: the decoders need memory, too
+            P = sum(parameter.numel() for parameter in self.shared)
+            self.J_TP = torch.zeros(len(self.terms), P, device=self.shared[0].device)
+        row_P = self.J_TP[self.terms.index(name)]
+        if name in self.rows:
+            row_P += flatten(grads, self.shared)
+        else:
+            self.rows[name] = [flatten(grads, self.shared, out=row_P)]
+
+    def mean(self, divisor_of: Mapping[str, float]) -> list[list[Tensor | None]]:
+        here = [self.terms.index(name) for name in divisor_of]
+        self.J_KP = self.J_TP if len(here) == len(self.J_TP) else self.J_TP[here]
+        for row_P, divisor in zip(self.J_KP, divisor_of.values(), strict=True):
+            if divisor != 1:
+                row_P /= divisor
+        return [[row_P] for row_P in self.J_KP]
+
+
+class AtRepresentation(Gradients):
+    """Gradients of what the decoders read: the parts' tensors stand side by side."""
+
+    def __init__(self, shared: Sequence[nn.Parameter], terms: Sequence[str]):
+        super().__init__(shared, terms)
+        self.rows = {name: [] for name in terms}
+        self.read: list[Tensor] = []
+
+    def add(self, z: Sequence[Tensor], z_grads: dict[str, Gradient]) -> None:
+        self.read += z
+        for name, row in self.rows.items():
+            row += z_grads.get(name, [None] * len(z))
+
+    def back(self, direction: Gradient) -> None:
+        super().back(onward(self.read, direction, self.shared, keep=False))
+
+
+KINDS = {"gramian": Gradients, "jacobian": Matrix, "representation": AtRepresentation}
+
+
+def onward(
+    z: Sequence[Tensor], z_grads: Gradient, shared: Sequence[nn.Parameter], keep: bool
+) -> Gradient:
+    """Gradients of the shared parameters from those of what the decoders read."""
+    reached = [(x, g) for x, g in zip(z, z_grads, strict=True) if g is not None]
+    if not reached:
+        return [None] * len(shared)
+    outputs, grads = zip(*reached, strict=True)
+    return torch.autograd.grad(outputs, shared, grads, retain_graph=keep, allow_unused=True)

@@ -20,9 +20,8 @@ from mtl_bench.data.loader import train_batches
 from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model, build_model
 from mtl_bench.train import checkpoint
-from mtl_bench.train.backward import Pass, Weighting, backward, losses_now
+from mtl_bench.train.backward import Pass, Weighting, backward, reevaluate
 from mtl_bench.train.curve import Curve
-from mtl_bench.train.gradients import stack_losses
 from mtl_bench.train.progress import Interrupted, Progress
 from mtl_bench.train.tracking import Tracker
 
@@ -108,8 +107,7 @@ def train(
             update_norm = norm_of(model.shared_parameters()) / engine.scaler.get_scale()
             grad_norm = engine.apply_gradients(optimizer, clipped, optim.clip)
             if method.reevaluates:
-                after_K = stack_losses(method, losses_now(parts[0], model))
-                method.after_step(weighting.loss_K, after_K)
+                reevaluate(method, weighting.step, parts[0], model)
             step += 1
 
             row = describe_step(weighting, method, model.tasks, bool(optim.cosine_every))
@@ -161,7 +159,8 @@ def build_method(cell: Cell, terms: Sequence[Term]) -> Method:
     seed = seed_for(cell.seed, "method")
     names = plugins.part_names(cell.method)
     if len(names) == 1:
-        return plugins.load("methods", cell.method)(terms, seed=seed, **cell.method_args)
+        found: Method = plugins.load("methods", cell.method)(terms, seed=seed, **cell.method_args)
+        return found
     parts = [
         plugins.load("methods", name)(terms, seed=seed, **cell.method_args.get(name, {}))
         for name in names
@@ -179,7 +178,8 @@ def schedule(step: int, optim: Optim) -> float:
     warm = 1.0
     if step < optim.warmup_steps:
         warm = optim.warmup_factor + (1 - optim.warmup_factor) * step / optim.warmup_steps
-    return warm * (1 - step / optim.steps) ** optim.poly_power
+    found: float = warm * (1 - step / optim.steps) ** optim.poly_power
+    return found
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, optim: Optim, step: int) -> float:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
-from mtl_bench.core.quiet import Quiet
+from mtl_bench.core.files import replacing
+from mtl_bench.core.locks import Quiet
 
 
 class Interrupted(KeyboardInterrupt):
@@ -47,6 +48,5 @@ class Progress:
         self._last = now
         state = {"stage": stage, "step": step, "steps": steps, "note": note}
         state["seconds"] = round(now - self._start, 1)
-        temporary = self._path.with_name(self._path.name + ".tmp")
-        temporary.write_text(json.dumps(state))
-        temporary.replace(self._path)
+        with replacing(self._path, synced=False) as file:
+            file.write(json.dumps(state).encode())

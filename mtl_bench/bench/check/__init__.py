@@ -2,15 +2,26 @@
 
 import ast
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mtl_bench.bench.check.backbones import BACKBONE_CHECKS
+from mtl_bench.bench.check.datasets import DATASET_CHECKS
+from mtl_bench.bench.check.engines import ENGINE_CHECKS
 from mtl_bench.bench.check.methods import METHOD_CHECKS
+from mtl_bench.bench.check.tasks import TASK_CHECKS
 from mtl_bench.core import plugins
+
+CHECKS: dict[str, Mapping[str, Callable[..., Any]]] = {
+    "methods": METHOD_CHECKS,
+    "backbones": BACKBONE_CHECKS,
+    "tasks": TASK_CHECKS,
+    "datasets": DATASET_CHECKS,
+    "engines": ENGINE_CHECKS,
+}
 
 
 @dataclass(frozen=True)
@@ -24,7 +35,7 @@ def check(kind: str, name: str) -> list[CheckResult]:
     """Run every check of a plug-in; a failed one says what was wrong, none stops the others.
 
     Args:
-        kind: "methods" or "backbones".
+        kind: one of `plugins.KINDS`.
         name: the file's stem.
     """
     path = plugins.path_of(kind, name)
@@ -33,22 +44,22 @@ def check(kind: str, name: str) -> list[CheckResult]:
     results.append(load)
     if load.ok:
         plugin = plugins.load(kind, name)
-        checks: dict[str, Callable[..., None]] = (
-            METHOD_CHECKS if kind == "methods" else BACKBONE_CHECKS
-        )
-        results += [_run(title, partial(run, plugin)) for title, run in checks.items()]
+        results += [_run(title, partial(run, plugin)) for title, run in CHECKS[kind].items()]
     return results
 
 
 def _run(name: str, call: Callable[[], Any]) -> CheckResult:
-    """Every exception of the plug-in is a failed check with its place, which is the point here."""
+    """Every exception of the plug-in is a failed check with its place, which is the point here.
+
+    A text that a check returns stands beside its name.
+    """
     try:
-        call()
+        said = call()
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}:{place.lineno}"
         return CheckResult(name, False, f"{type(error).__name__}: {error} ({where})")
-    return CheckResult(name, True)
+    return CheckResult(name, True, said if isinstance(said, str) else "")
 
 
 def _documented(path: Path) -> None:

@@ -1,0 +1,152 @@
+"""What every task has to hold, tried on the built-in data with a small network."""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mtl_bench.core.batch import Batch
+from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.core.dataset import NEIGHBOURS, dataset_of
+from mtl_bench.core.plugins import files
+from mtl_bench.core.quality import columns_of
+from mtl_bench.core.task import Results, Task, tasks_of, terms_of
+from mtl_bench.data.loader import eval_batches, train_batches
+from mtl_bench.data.samples import open_samples
+from mtl_bench.evaluate.walk import evaluating, frame_of, frame_truth, predict, true_size
+from mtl_bench.model import Model, build_model
+
+RECIPE, BACKBONE = "smoke", "tiny"
+
+
+@functools.cache
+def _root() -> Path:
+    recipe = load_recipe(RECIPE)
+    return dataset_of(recipe).render(recipe.data, quiet=True)
+
+
+def _model(kind: type[Task]) -> Model:
+    """A network with this task and those whose results it reads."""
+    recipe = load_recipe(RECIPE)
+    names = (kind.name, *(name for name in kind.after if name in files("tasks")))
+    tasks = tasks_of(recipe, names, dataset_of(recipe).labels)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return build_model(Cell(recipe, BACKBONE, "", names), tasks)
+
+
+def _on_built_in(check: Callable[[type[Task]], None]) -> Callable[[type[Task]], str | None]:
+    """Only where the built-in data have what the task needs."""
+
+    def checked(kind: type[Task]) -> str | None:
+        has = dataset_of(load_recipe(RECIPE)).fields.keys() | {NEIGHBOURS}
+        lacking = sorted((kind.needs | kind.truth) - has)
+        if lacking:
+            return f"not tried: the built-in data have no {', '.join(lacking)}"
+        check(kind)
+        return None
+
+    return checked
+
+
+def _batch(model: Model, training: bool) -> Batch:
+    recipe = load_recipe(RECIPE)
+    split = "train" if training else recipe.evaluate.split
+    samples = open_samples(recipe, model.tasks, split, _root(), training)
+    if training:
+        for task in model.tasks:
+            task.begin(samples.dataset)
+        return next(train_batches(samples, 2, seed=0))
+    return next(eval_batches(samples, 2))
+
+
+def _own(model: Model, kind: type[Task]) -> Task:
+    return next(task for task in model.tasks if task.name == kind.name)
+
+
+def _declared(kind: type[Task]) -> None:
+    names = [term.name for term in kind.terms]
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"terms {names}: a task has one or more, of different names")
+    kinds = {term.kind for term in kind.terms} | {kind.kind}
+    if not kinds <= {"classification", "regression"}:
+        raise ValueError(f"kinds {sorted(kinds)} are not classification or regression")
+    if not columns_of(kind.name):
+        raise ValueError("no columns: nothing of what it measures would stand in a table")
+
+
+def _losses(kind: type[Task]) -> None:
+    """Each term is a finite scalar, and together they train the task's own head."""
+    model = _model(kind).train()
+    batch = _batch(model, training=True)
+    losses = model.losses(model(batch), batch)
+    wanted = {term.name for term in terms_of(model.tasks)}
+    if set(losses) != wanted:
+        raise ValueError(f"losses {sorted(losses)} are not the terms {sorted(wanted)}")
+    own = [losses[term.name] for term in kind.terms]
+    if not all(loss.dim() == 0 and torch.isfinite(loss) for loss in own):
+        raise ValueError(f"losses {[loss.tolist() for loss in own]} are no finite scalars")
+    torch.stack(own).sum().backward()
+    heads = _own(model, kind).head((8, 8, 8), load_recipe(RECIPE).network).heads
+    trained = {
+        name.split(".")[1]
+        for name, parameter in model.net.named_parameters()
+        if name.startswith("heads.") and parameter.grad is not None
+    }
+    if not heads.keys() <= trained:
+        raise ValueError(f"no loss trains {', '.join(heads.keys() - trained)}")
+
+
+def _results(model: Model, batch: Batch) -> dict[str, Results]:
+    with evaluating(model), torch.inference_mode():
+        return predict(model, batch, model.tasks, true_size(batch))
+
+
+def _measures(kind: type[Task]) -> None:
+    """Results have one entry a frame; the metrics have the columns; two halves add up."""
+    model = _model(kind)
+    batch = _batch(model, training=False)
+    found, task = _results(model, batch)[kind.name], _own(model, kind)
+    uneven = [name for name, value in found.items() if len(value) != len(batch.names)]
+    if uneven:
+        raise ValueError(f"results {', '.join(uneven)} have not one entry a frame")
+    whole, first, second = (task.metrics()[0] for _ in range(3))
+    for slot in range(len(batch.names)):
+        for metric in (whole, second if slot else first):
+            metric.update(frame_truth(task, batch, slot), frame_of(found, slot))
+    first.add(second.state())
+    numbers, added = whole.compute(), first.compute()
+    if numbers.keys() != added.keys() or any(
+        abs(numbers[key] - added[key]) > 1e-6 * max(abs(numbers[key]), 1) for key in numbers
+    ):
+        raise ValueError(f"two halves of a split add up to {added}, not to {numbers}")
+    missing = [c.key for c in columns_of(kind.name) if c.key not in numbers]
+    if len(missing) == len(columns_of(kind.name)):
+        raise ValueError(f"no column has a number: {', '.join(missing)} are not in {numbers}")
+
+
+def _batched(kind: type[Task]) -> None:
+    """A frame's results do not depend on its neighbours in the batch."""
+    model = _model(kind)
+    batch = _batch(model, training=False)
+    together = _results(model, batch)[kind.name]
+    for slot, part in enumerate(batch.split(1)):
+        for name, value in _results(model, part)[kind.name].items():
+            if not _near(value[0], together[name][slot]):
+                raise ValueError(f"'{name}' of a frame differs in a batch of two")
+
+
+def _near(a: Tensor, b: Tensor) -> bool:
+    if a.is_floating_point():
+        return torch.allclose(a, b, rtol=1e-3, atol=1e-4, equal_nan=True)
+    return float((a == b).float().mean()) > 0.99  # a tie may go either way
+
+
+TASK_CHECKS: dict[str, Callable[[type[Task]], str | None]] = {
+    "declared": lambda kind: _declared(kind),
+    "losses train it": _on_built_in(_losses),
+    "metrics have its columns": _on_built_in(_measures),
+    "frames alone and together": _on_built_in(_batched),
+}

@@ -1,0 +1,272 @@
+"""What is stored of jobs in runs/, and what that says about each.
+
+runs/<method>-<backbone>-s<seed>-<id>/    of a cell
+    cell.json      what to run, whole
+    code.json      fingerprints of the code that began it, by stage: a checkpoint is continued by
+                   no other code for training
+    claim          who is running it now
+    progress.json  how far that is
+    last.pt        checkpoint          curve.csv  losses, weights, rate per step
+    taken.json     memory, and seconds of pseudo labels, for a run that is continued
+    pseudo_labels/ of a video cell, made by its parent's checkpoint
+    log.txt        what the run printed
+    row.json       the result; it appears by rename at the very end, so it exists = done
+    failed.json    why there is none
+    set-aside-N/   an earlier training, by code that has changed since
+runs/latency/                             of timings
+    claim          who is timing now: one launcher at a time, with one process at a time
+    <id>.json      a timing's row, by rename at its end: what `mtl-bench latency --json` wrote, and
+                   `timing`, `code`, `seconds`; its status tells why it has no numbers
+    <id>.log       what the process printed
+"""
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_parents
+from mtl_bench.core import provenance
+from mtl_bench.core.config import Cell
+from mtl_bench.core.files import read_json, write_json
+from mtl_bench.core.locks import claimed_by
+from mtl_bench.core.plain import to_dict
+
+TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
+ASIDE = "set-aside-"
+KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
+
+
+@dataclass(frozen=True)
+class State:
+    word: str  # one of the words of the job's kind
+    why: str = ""
+    row: dict[str, Any] | None = None
+    stale: Mapping[str, str] = field(default_factory=dict)  # stage -> what of its code changed
+    headline: str = ""
+
+    @property
+    def trained(self) -> bool:
+        """Whether its training is done, by the code of today."""
+        return self.word in ("done", "stale") and "train" not in self.stale
+
+
+def run_dir(job: Job, runs: Path) -> Path:
+    return runs / job.slug
+
+
+def load_row(directory: Path) -> dict[str, Any] | None:
+    row: dict[str, Any] | None = read_json(directory / "row.json")
+    return row
+
+
+# --- status ---------------------------------------------------------------------------------------
+
+
+def status(job: Job, runs: Path) -> str:
+    """Of a cell: done | stale | failed | interrupted | running | missing; of a timing: done | stale
+    | wrong | failed | unavailable | missing"""
+    return inspect(job, runs).word
+
+
+def inspect(job: Job, runs: Path) -> State:
+    """A job's status, why it is that, and its row where there is one."""
+    if claimed_by(run_dir(job, runs)) is not None:
+        return State("running")
+    return stored(job, runs)
+
+
+def stored(job: Job, runs: Path) -> State:
+    """The status that the files give, whoever runs the job at the moment.
+
+    Raises:
+        ValueError: a row that is damaged.
+    """
+    row = read_json(kind_of(job).row_file(job, runs))
+    if row is not None:
+        return state_of(row, job)
+    directory = run_dir(job, runs)
+    failure = read_json(directory / "failed.json")
+    if failure is not None:
+        return State("failed", str(failure.get("error", "")))
+    if any((directory / name).exists() for name in ("code.json", "progress.json", "last.pt")):
+        return State("interrupted")
+    return State("missing")
+
+
+def state_of(row: dict[str, Any], job: Job) -> State:
+    """The status of a job that has a row."""
+    kind = kind_of(job)
+    headline = kind.headline(row.get("metric", {}))
+    try:
+        stale = changed(row.get("code", {}), job)
+        changes = provenance.in_words(stale)
+    except ValueError as error:  # a plug-in that has gone, has a double now, or is no Python
+        stale, changes = dict.fromkeys(kind.stages, str(error)), str(error)
+    word = row.get("status", "done")
+    if word != "done":
+        return State(word, str(row.get(kind.why, "")), row, stale, headline)
+    return State("stale" if stale else "done", changes, row, stale, headline)
+
+
+def changed(before: Mapping[str, Any], job: Job) -> dict[str, str]:
+    """Stage -> what of its code changed since fingerprints were taken; empty for nothing.
+
+    Raises:
+        ValueError: a plug-in that is not there, or is no Python.
+    """
+    kind = kind_of(job)
+    return provenance.changes(before, kind.code(job), kind.parts(job))
+
+
+def rows(
+    jobs: Iterable[Job], runs: Path, names: Mapping[str, str] = NOTHING
+) -> list[dict[str, Any]]:
+    """One row per job for a report: as stored where there is one, with the status of today.
+
+    Args:
+        names: id -> what the grid calls it.
+    """
+    found = []
+    for job in jobs:
+        state, kind = inspect(job, runs), kind_of(job)
+        named = {"name": names[job.id]} if job.id in names else {}
+        today = {"status": state.word, kind.why: state.why}
+        found.append({**kind.identity(job), **(state.row or {}), **named, **today})
+    return found
+
+
+def all_rows(runs: Path) -> list[dict[str, Any]]:
+    """The rows of all finished cells, with the status of today."""
+    found = []
+    for path in sorted(runs.glob("*/row.json")):
+        row = load_row(path.parent) or {}
+        state = state_of(row, load_cell(path.with_name("cell.json")))
+        found.append({**row, "status": state.word, "error": state.why})
+    return found
+
+
+def to_run(jobs: Iterable[Job], runs: Path, rerun: str | None = None) -> list[Job]:
+    """The jobs without a result, those asked for again, and before them what they need.
+
+    An output that was wrong is tried again once its code has changed.
+
+    Args:
+        rerun: `stale`: also those whose code changed, each from the first stage on that this
+            concerns. `failed`: cells that failed begin at step 0 rather than at their checkpoint,
+            and timings whose output was wrong are taken again. `all`: every job, from the start.
+            `latency`: of cells that are done, only the latency; every timing.
+    """
+    found: dict[str, bool] = {}
+
+    def wanted(job: Job) -> bool:
+        if job.id not in found:
+            state, kind = inspect(job, runs), kind_of(job)
+            words = {*kind.unfinished, *kind.again.get(rerun or "", ())}
+            found[job.id] = state.word in words or bool(state.word == "wrong" and state.stale)
+        return found[job.id]
+
+    return [job for job in with_parents(filter(wanted, jobs)) if wanted(job)]
+
+
+def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path) -> str:
+    """`done 3   failed 1`, and what to do about some of them."""
+    states = [inspect(job, runs) for job in jobs]
+    reasons = "; ".join(sorted({state.why for state in states if state.word == "stale"}))
+    hints = {"stale": f" ({reasons}; --rerun stale)", "failed": " (tried again by the next ablate)"}
+    hints["wrong"] = " (--rerun failed)"
+    counts = {word: sum(state.word == word for state in states) for word in kind.words}
+    return "   ".join(f"{word} {n}{hints.get(word, '')}" for word, n in counts.items() if n)
+
+
+def hours_to_run(todo: Sequence[Job], jobs: Iterable[Job], runs: Path) -> float | None:
+    """Expected duration one after another, from those that are done; None where none is."""
+    work = seconds = 0.0
+    for job in jobs:
+        kind, row = kind_of(job), inspect(job, runs).row
+        if row is not None and kind.work(job) and kind.seconds(row):
+            work += kind.work(job)
+            seconds += kind.seconds(row)
+    return seconds / work * sum(kind_of(job).work(job) for job in todo) / 3600 if work else None
+
+
+# --- beginning and failing ------------------------------------------------------------------------
+
+
+def done_already(cell: Cell, runs: Path, renew: bool = False) -> str:
+    """A line that says so, and how to run it again; empty where it is not, or is stale and `renew`
+    is said."""
+    state = stored(cell, runs)
+    if state.row is None or (renew and state.word == "stale"):
+        return ""
+    stale = f", but stale: {state.why}" if state.word == "stale" else ""
+    remedy = f"{'--stale' if stale else '--rerun'} runs it again"
+    return f"done already{stale} ({remedy}): {run_dir(cell, runs) / 'row.json'}"
+
+
+def begin(cell: Cell, runs: Path) -> tuple[Path, str]:
+    """Make a claimed run directory ready; what other code for training had begun is set aside.
+
+    Returns:
+        The directory, and a line about an earlier start that is not continued (empty for none).
+
+    Raises:
+        ValueError: a plug-in that is not there, or is no Python.
+    """
+    directory = run_dir(cell, runs)
+    before, line = read_json(directory / "code.json"), ""
+    if before is not None and "train" in (stale := changed(before, cell)):
+        line = set_aside(directory, stale["train"])
+    (directory / "failed.json").unlink(missing_ok=True)
+    write_json(directory / "cell.json", to_dict(cell))
+    write_json(directory / "code.json", provenance.code(cell))
+    return directory, line
+
+
+def can_renew(cell: Cell, runs: Path) -> bool:
+    """Whether a stale row can be brought up to date, or at least tried, without training."""
+    state = stored(cell, runs)
+    older = provenance.STAMPED_BEFORE in state.stale.values()
+    there = cell.single_task or (run_dir(cell, runs) / "last.pt").is_file()
+    return state.word == "stale" and there and (state.trained or older)
+
+
+def set_aside(directory: Path, why: str) -> str:
+    """Move an earlier training into a folder of its own, so that another begins at step 0.
+
+    Returns:
+        A line that says so and why; empty where nothing was trained.
+    """
+    if not any((directory / name).exists() for name in TRAINED):
+        clear(directory)
+        return ""
+    numbers = [int(path.name.removeprefix(ASIDE)) for path in directory.glob(f"{ASIDE}*")]
+    aside = directory / f"{ASIDE}{max(numbers, default=0) + 1}"
+    aside.mkdir()
+    for path in _of_a_start(directory):
+        path.rename(aside / path.name)
+    if (directory / "cell.json").is_file():
+        shutil.copy(directory / "cell.json", aside)
+    return f"starting over ({why}); what there was is kept in {aside}"
+
+
+def clear(directory: Path) -> None:
+    """Forget checkpoint, row and failure: the next start begins at step 0."""
+    for path in _of_a_start(directory):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+
+
+def _of_a_start(directory: Path) -> list[Path]:
+    """What a run directory has of its last start."""
+    paths = list(directory.iterdir()) if directory.is_dir() else []
+    return [p for p in paths if p.name not in KEPT and not p.name.startswith(ASIDE)]
+
+
+def write_failure(directory: Path, error: str, trace: str = "", code: int | None = None) -> None:
+    """Leave `failed.json`: the error in one line, the end of its traceback, the exit code."""
+    tail = "\n".join(trace.splitlines()[-30:])
+    write_json(directory / "failed.json", {"error": error, "traceback": tail, "exit_code": code})

@@ -1,0 +1,1 @@
+"""Networks as they are deployed: the graph, the engines that run it, their times, ONNX files."""
