@@ -11,7 +11,7 @@ from kitti_tree import write_tree
 from test_cloud_page import shown
 from typer.testing import CliRunner
 
-from mtl_bench.bench.results import write_json
+from mtl_bench.core.files import write_json
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.device import Engine

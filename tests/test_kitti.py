@@ -31,7 +31,8 @@ from kitti_tree import (
 )
 from typer.testing import CliRunner
 
-from mtl_bench.bench import claim, results
+from mtl_bench.bench import store
+from mtl_bench.core import locks
 from mtl_bench.bench.run import run_cell
 from mtl_bench.cli.app import app
 from mtl_bench.core import config
@@ -542,8 +543,8 @@ def cell_of(recipe="kitti-smoke", tasks=config.TASKS, dataset="kitti", **data):
 
 
 def execute(cell, runs, root):
-    with claim.claim(results.run_dir(cell, runs)):
-        directory, _ = results.begin(cell, runs)
+    with locks.claim(store.run_dir(cell, runs)):
+        directory, _ = store.begin(cell, runs)
         return run_cell(cell, directory, root, "cpu", echo=lambda line: None)
 
 
@@ -553,7 +554,7 @@ def teacher(smoke_root, tmp_path_factory):
     cell = Cell(load_recipe("smoke"), "tiny", "fixed_uncertainty", tasks=("panoptic",))
     runs = tmp_path_factory.mktemp("teacher")
     execute(cell, runs, smoke_root)
-    return results.run_dir(cell, runs)
+    return store.run_dir(cell, runs)
 
 
 def test_a_cityscapes_cell_labels_kitti(tree, teacher):

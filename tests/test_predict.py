@@ -17,7 +17,8 @@ from conftest import SHARED
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench.bench import results
+from mtl_bench.bench import store
+from mtl_bench.core.files import write_json
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Cell, load_recipe, to_dict
 from mtl_bench.core.geometry import scale_intrinsics
@@ -293,7 +294,7 @@ def test_a_folder_is_whole_or_not_there(tmp_path):
 def write_run(folder, cell, labels=CITYSCAPES20):
     torch.manual_seed(0)
     folder.mkdir()
-    results.write_json(folder / "cell.json", to_dict(cell))
+    write_json(folder / "cell.json", to_dict(cell))
     state = {"format": 1, "model": build_model(cell, labels).state_dict()}
     torch.save(state, folder / "last.pt")
     return folder

@@ -15,7 +15,8 @@ from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench.bench import results
+from mtl_bench.bench import store
+from mtl_bench.core.files import write_json
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Augment, Cell, Data, Evaluate, Loss, Network, PseudoLabels, Recipe
 from mtl_bench.core.plain import to_dict
@@ -539,7 +540,7 @@ def trained(smoke_cell, tmp_path):
     cell = with_recipe(smoke_cell, data=data)
     directory = tmp_path / "run"
     directory.mkdir()
-    results.write_json(directory / "cell.json", to_dict(cell))
+    write_json(directory / "cell.json", to_dict(cell))
     torch.manual_seed(0)
     state = {"format": checkpoint.FORMAT, "model": build_model(cell, CITYSCAPES20).state_dict()}
     torch.save(state, directory / "last.pt")
