@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 import torch
 
-from mtl_bench.core.config import Cell, load_recipe
-from mtl_bench.data import frame_cache, loader, scenes as synthetic
 from mtl_bench.core.batch import Batch
+from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.data import frame_cache, loader
+from mtl_bench.data import scenes as synthetic
 from mtl_bench.data.cityscapes import Cityscapes
 
 NOISE = 0.62  # of 255, standard deviation

@@ -20,12 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtl_bench.core.config import Evaluate
+from mtl_bench.core.batch import Camera
+from mtl_bench.core.config import Evaluate, Recipe
 from mtl_bench.core.geometry import back_project, depth_from_inverse
+from mtl_bench.core.task import finish, tasks_of
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.tasks.finish import Finish
-from mtl_bench.tasks.panoptic import postprocess
-from mtl_bench.tasks.panoptic.grouping import nearest
+from mtl_bench.tasks import pixels
+from mtl_bench.tasks.depth.scale import dgc_scale
+from mtl_bench.tasks.panoptic import grouping
+from mtl_bench.tasks.panoptic.nearest_center import nearest
 
 COUNTS = (5, 50, 200)
 THINGS = CITYSCAPES20.things
@@ -35,7 +38,7 @@ Inputs = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def scene(instances: int, height: int = 1024, width: int = 2048, seed: int = 0) -> Inputs:
-    """Finish's arguments: classes, heat map, offsets, inverse depth, K, camera height, pitch."""
+    """Arguments of `whole`: classes, heat map, offsets, inverse depth, K, camera height, pitch."""
     rng = np.random.default_rng(seed)
     scale = width / 2048
     y_HW, x_HW = np.mgrid[:height, :width].astype(np.float32)
@@ -69,32 +72,51 @@ def scene(instances: int, height: int = 1024, width: int = 2048, seed: int = 0) 
     return (classes, *maps, inverse, K, torch.tensor([1.4]), torch.tensor([0.01]))  # type: ignore
 
 
-def finish() -> Finish:
-    return Finish(THINGS, ROAD, Evaluate(), (EGO, SKY))
+TASKS = tasks_of(Recipe(), ("panoptic", "depth"), CITYSCAPES20)
+
+
+def whole(
+    semantic: Tensor,
+    heat: Tensor,
+    offset: Tensor,
+    inverse: Tensor,
+    K: Tensor,
+    camera_height: Tensor,
+    pitch: Tensor,
+) -> dict[str, Tensor]:
+    """All that tasks make of their maps, 3D points included."""
+    maps = {
+        "panoptic": {"semantic": semantic, "center": heat, "offset": offset},
+        "depth": {"inverse": inverse},
+    }
+    camera = Camera(K, camera_height, pitch)
+    done = finish(TASKS, maps, camera)
+    points = TASKS[1].points(done, camera)
+    assert points is not None
+    return done["panoptic"] | done["depth"] | {"points": points}
 
 
 def steps(inputs: Inputs, settings: Evaluate) -> dict[str, Callable[[], object]]:
-    """The parts of `finish()(*inputs)`, and the whole."""
+    """The parts of `whole`, and it."""
     semantic, heat, offset, inverse, K, camera_height, pitch = inputs
-    class_1HW = postprocess.classes(semantic)
-    centers, count = postprocess.find_centers(heat, settings)
-    _, y_N, x_N = postprocess.member(class_1HW, THINGS).nonzero(as_tuple=True)
+    class_1HW = grouping.classes(semantic)
+    centers, count = grouping.find_centers(heat, settings)
+    _, y_N, x_N = pixels.member(class_1HW, THINGS).nonzero(as_tuple=True)
     point_2N = torch.stack([y_N, x_N]) + offset[0][:, y_N, x_N]
     image_N = torch.zeros_like(y_N)
     depth = depth_from_inverse(inverse)
     road = class_1HW == ROAD
     size = (heat.shape[2], heat.shape[3])
-    scaling = (depth, K, camera_height, road, 0.0, pitch)
-    whole = finish()
+    scaling = (depth, K, camera_height, road, pitch)
     return {
-        "NMS, centers": lambda: postprocess.find_centers(heat, settings),
-        "stuff filter": lambda: postprocess._stuff(class_1HW, THINGS, settings.stuff_area),
-        "grouping, vote": lambda: postprocess.group(
+        "NMS, centers": lambda: grouping.find_centers(heat, settings),
+        "stuff filter": lambda: grouping._stuff(class_1HW, THINGS, settings.stuff_area),
+        "grouping, vote": lambda: grouping.group(
             class_1HW, centers, count, offset, THINGS, settings.stuff_area
         ),
         "- nearest": lambda: nearest(point_2N, image_N, centers, count, size),
         "(table)": lambda: nearest_by_table(point_2N, centers[0]),
-        "DGC scale": lambda: postprocess.dgc_scale(*scaling),
+        "DGC scale": lambda: dgc_scale(*scaling),
         "points": lambda: back_project(depth, K),
         "whole": lambda: whole(*inputs),
     }
@@ -147,7 +169,7 @@ def main() -> None:
     for name in parts[COUNTS[0]]:
         row = [statistics.median(times[name, n]) for n in COUNTS]
         print(f"{name:16}" + "".join(f"{value:9.1f}" for value in row))
-    peaks = [peak_mib(lambda n=n: finish()(*scenes[n])) for n in COUNTS]  # type: ignore[misc]
+    peaks = [peak_mib(lambda n=n: whole(*scenes[n])) for n in COUNTS]  # type: ignore[misc]
     print(f"{'whole, peak MiB':16}" + "".join(f"{value:9.0f}" for value in peaks))
     peaks = [peak_mib(parts[n]["grouping, vote"]) for n in COUNTS]
     print(f"{'grouping, peak':16}" + "".join(f"{value:9.0f}" for value in peaks))

@@ -12,17 +12,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from mtl_bench.tasks.losses import loss_terms
 from torch import Tensor, nn
 
+from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.device import Engine
 from mtl_bench.core.terms import Term, gather
 from mtl_bench.data import scenes as synthetic
-from mtl_bench.core.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import open_dataset, train_batches
 from mtl_bench.model import Model
-from mtl_bench.tasks.losses import loss_terms
 from mtl_bench.train.backward import Pass, backward, reevaluate
 from mtl_bench.train.loop import build, build_method
 

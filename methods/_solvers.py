@@ -44,7 +44,8 @@ def pseudo_inverse(C_KK: Tensor) -> Tensor:
     """Of a correlation matrix: directions within rounding of zero are left out."""
     eigenvalue_K, V_KK = torch.linalg.eigh(C_KK)
     inverse_K = torch.where(eigenvalue_K > ROUNDING, 1 / eigenvalue_K, 0.0)
-    return (V_KK * inverse_K) @ V_KK.T
+    found: Tensor = (V_KK * inverse_K) @ V_KK.T
+    return found
 
 
 def equal_projections(C_KK: Tensor) -> Tensor:
@@ -60,7 +61,8 @@ def root(G_KK: Tensor) -> Tensor:
     """R with R^T R = G, accurate in every column however different the norms are."""
     norm_K, C_KK = correlation(G_KK)
     eigenvalue_K, V_KK = torch.linalg.eigh(C_KK)
-    return eigenvalue_K.clamp_min(0).sqrt()[:, None] * V_KK.T * norm_K
+    found: Tensor = eigenvalue_K.clamp_min(0).sqrt()[:, None] * V_KK.T * norm_K
+    return found
 
 
 def least_squares(A_NK: Tensor, b_N: Tensor) -> Tensor:

@@ -22,4 +22,5 @@ class Aligned(GradientMethod):
         rank = int((torch.linalg.eigvalsh(C_KK) > ROUNDING).sum())  # that of G
         _, sigma_K, V_KK = torch.linalg.svd(root(G_KK))  # finer than eigenvalues, the squares
         sigma_R, V_RK = sigma_K[:rank].clamp_min(torch.finfo(G_KK.dtype).tiny), V_KK[:rank]
-        return (sigma_R[-1:] / sigma_R * V_RK.sum(1)) @ V_RK
+        found: Tensor = (sigma_R[-1:] / sigma_R * V_RK.sum(1)) @ V_RK
+        return found

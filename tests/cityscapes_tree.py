@@ -6,8 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from mtl_bench.core import config
+from mtl_bench.core.batch import Batch
 from mtl_bench.core.dataset import NEIGHBOURS, Dataset
 from mtl_bench.data.cityscapes import Cityscapes
 from mtl_bench.data.samples import Samples
@@ -89,6 +91,16 @@ def open_samples_of(
     dataset = kind(root, split, data, needs=needs, training=training, **changes)
     task = Panoptic(replace(config.Recipe(), loss=loss), dataset.labels)
     return Samples(dataset, augment, [task.targets] if panoptic else [])
+
+
+def assert_same(one: Batch, other: Batch) -> None:
+    """To the last bit."""
+    assert one.names == other.names
+    ones, others = one.tensors(), other.tensors()
+    assert ones.keys() == others.keys()
+    for name, value in ones.items():
+        assert value.dtype == others[name].dtype
+        assert torch.equal(value, others[name]), name
 
 
 def put_ego_mask(root: Path, size=(HEIGHT, WIDTH)) -> np.ndarray:

@@ -1,8 +1,8 @@
 """Rows of a grid of latencies as `store.rows` gives them, made up."""
 
 from mtl_bench.bench.jobs import Timing
-from mtl_bench.core.config import Recipe
 from mtl_bench.core.plain import to_dict
+from mtl_bench.core.recipe import Recipe
 
 TASKS = Recipe.tasks
 
@@ -62,7 +62,11 @@ def make_row(engine="plain", backbone="resnet18", status="done", mean_ms=None, *
     own = changes.pop("metric", {})
     more = {key: changes.pop(key) for key in ("why", "smoke", "weights") if key in changes}
     timing = Timing(backbone, engine, **changes)
-    work = pixels_of(timing) * (1 if timing.tasks == TASKS else 0.7) * BACKBONES.get(backbone, 1.0)
+    work = (
+        pixels_of(timing)
+        * (1 if timing.tasks == Recipe.tasks else 0.7)
+        * BACKBONES.get(backbone, 1.0)
+    )
     if mean_ms is None:
         mean_ms = 2000 * work * FACTOR.get(engine, 1) * (0.6 if timing.precision == "bf16" else 1)
     row = {
@@ -89,7 +93,7 @@ def grid_rows():
     """Two sizes, two sets of tasks, two backbones; no TensorRT, one line of each trouble."""
     rows = []
     for size in ("384x1280", "1024x2048"):
-        for tasks in (TASKS, ("panoptic",)):
+        for tasks in (Recipe.tasks, ("panoptic",)):
             for backbone in BACKBONES:
                 named = {"backbone": backbone, "size": size, "tasks": tasks}
                 rows += [make_row(engine, **named) for engine in FACTOR]

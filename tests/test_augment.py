@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from kornia.enhance import (
@@ -7,8 +9,9 @@ from kornia.enhance import (
 )
 
 from mtl_bench.core import config
-from mtl_bench.data import augment as A
+from mtl_bench.core.dataset import Kind
 from mtl_bench.core.labels import OUTSIDE
+from mtl_bench.data import augment as A
 
 PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
 MEAN = torch.tensor([123.675, 116.28, 103.53]) / 255
@@ -29,6 +32,23 @@ def frames(height=24, width=40, count=3, seed=1):
 
 def ids(height=24, width=40):
     return torch.randint(0, 34, (height, width), dtype=torch.int32, generator=generator(2))
+
+
+def augment(picture, K, labels, settings, generator):
+    """With the labels as a field of their own too, so that fields and the static ids go one way."""
+    view = A.augment(
+        picture, K, labels, {"ids": labels.clone()}, {"ids": Kind.IDS}, settings, generator
+    )
+    assert torch.equal(view.fields["ids"], view.static_HW)
+    return view
+
+
+def resize(picture, K, labels, factor, window=None):
+    """Frames, intrinsics and labels; `window` cuts all."""
+    size = A._times(labels.shape, factor)
+    whole = (slice(0, size[0]), slice(0, size[1]))
+    resized, resized_K = A.resize(picture, K, tuple(labels.shape), factor, window)
+    return resized, resized_K, A._nearest_of(labels, size, window or whole)
 
 
 def projection(K, point):
@@ -57,7 +77,10 @@ def peak(picture):
 
 def test_flip_moves_the_principal_point_with_the_picture():
     picture, K, labels = marked()
-    flipped, flipped_K, flipped_labels = A.flip(picture, K, labels)
+    settings = replace(PLAIN, flip=True)
+    views = (augment(picture, K, labels, settings, generator(seed)) for seed in range(20))
+    view = next(view for view in views if not torch.equal(view.K_33, K))
+    flipped, flipped_K, flipped_labels = view.clean_N3HW, view.K_33, view.static_HW
     mirrored = POINT * torch.tensor([-1, 1, 1])
     torch.testing.assert_close(projection(flipped_K, mirrored), peak(flipped))
     assert torch.equal(flipped_labels.argmax(), flipped[0, 0].argmax())
@@ -67,7 +90,7 @@ def test_flip_moves_the_principal_point_with_the_picture():
 @pytest.mark.parametrize("factor", [2.0, 3.0, 0.5, 1.5])
 def test_resize_moves_the_camera_with_the_picture(factor):
     picture, K, labels = marked()
-    resized, resized_K, resized_labels = A.resize(picture, K, labels, factor)
+    resized, resized_K, resized_labels = resize(picture, K, labels, factor)
     assert resized.shape[-2:] == (24 * factor, 40 * factor) == resized_labels.shape
     torch.testing.assert_close(projection(resized_K, POINT), peak(resized), atol=0.05, rtol=0)
     if factor > 1:
@@ -78,7 +101,7 @@ def test_resize_moves_the_camera_with_the_picture(factor):
 
 def test_shrunk_labels_are_those_in_the_middle():
     labels = torch.arange(24 * 39, dtype=torch.int32).reshape(24, 39)
-    _, _, resized = A.resize(frames(24, 39), camera(), labels, 1 / 3)
+    _, _, resized = resize(frames(24, 39), camera(), labels, 1 / 3)
     assert torch.equal(resized, labels[1::3, 1::3])
 
 
@@ -94,9 +117,9 @@ def test_crop_pad_and_flip_keep_the_point_on_its_pixel():
     )
     seen = {False: 0, True: 0}
     for seed in range(40):
-        view = A.augment(picture, K, labels, settings, generator(seed))
+        view = augment(picture, K, labels, settings, generator(seed))
         assert view.clean_N3HW.shape == (3, 3, 20, 60)
-        light = torch.where(view.instance_ids_HW != OUTSIDE, view.clean_N3HW, 0)
+        light = torch.where(view.static_HW != OUTSIDE, view.clean_N3HW, 0)
         direct = projection(view.K_33, POINT)
         mirrored = projection(view.K_33, POINT * torch.tensor([-1, 1, 1]))
         if not (3 <= direct[1] <= 16 and min(direct[0], mirrored[0]) >= 3):
@@ -111,8 +134,8 @@ def test_crop_pad_and_flip_keep_the_point_on_its_pixel():
 
 def test_padding_has_one_colour_and_no_label():
     settings = config.Augment(crop=(40, 60), flip=True)
-    view = A.augment(frames(), camera(), ids(), settings, generator())
-    outside = view.instance_ids_HW == OUTSIDE
+    view = augment(frames(), camera(), ids(), settings, generator())
+    outside = view.static_HW == OUTSIDE
     assert outside.sum() == 40 * 60 - 24 * 40
     assert outside.any(0).all()  # above or below
     assert outside.any(1).all()  # at the sides
@@ -126,12 +149,12 @@ def test_geometry_is_shared_by_frames_and_labels():
     same = labels.to(torch.uint8).expand(3, 3, -1, -1)
     settings = config.Augment(crop=(16, 50))
     for seed in range(6):
-        view = A.augment(same, camera(), labels, settings, generator(seed))
-        inside = view.instance_ids_HW != OUTSIDE
+        view = augment(same, camera(), labels, settings, generator(seed))
+        inside = view.static_HW != OUTSIDE
         for frame in view.clean_N3HW:
             for channel in frame:
                 shown = (channel * 255).round().int()
-                assert torch.equal(shown[inside], view.instance_ids_HW[inside])
+                assert torch.equal(shown[inside], view.static_HW[inside])
 
 
 def test_jitter_is_one_colour_map_for_all_frames():
@@ -180,16 +203,16 @@ def test_hue_turn_agrees_with_a_full_circle_and_leaves_gray_alone():
 
 def test_no_change_asked_for_is_no_change():
     picture = frames()
-    view = A.augment(picture, camera(), ids(), PLAIN, generator())
+    view = augment(picture, camera(), ids(), PLAIN, generator())
     assert torch.equal(view.clean_N3HW, picture.float() / 255)
     assert torch.equal(view.jittered_N3HW, view.clean_N3HW)
     assert torch.equal(view.K_33, camera())
-    assert torch.equal(view.instance_ids_HW, ids())
+    assert torch.equal(view.static_HW, ids())
 
 
 def test_the_input_is_left_alone():
     picture, K, labels = frames(), camera(), ids()
-    A.augment(picture, K, labels, config.Augment(crop=(30, 30)), generator())
+    augment(picture, K, labels, config.Augment(crop=(30, 30)), generator())
     assert torch.equal(picture, frames())
     assert torch.equal(K, camera())
     assert torch.equal(labels, ids())
@@ -198,7 +221,7 @@ def test_the_input_is_left_alone():
 def test_scales_without_a_crop_keep_the_input_size():
     settings = config.Augment(scales=(0.5, 2.0))
     sizes = {
-        tuple(A.augment(frames(), camera(), ids(), settings, generator(s)).clean_N3HW.shape)
+        tuple(augment(frames(), camera(), ids(), settings, generator(s)).clean_N3HW.shape)
         for s in range(6)
     }
     assert sizes == {(3, 3, 24, 40)}
@@ -207,16 +230,16 @@ def test_scales_without_a_crop_keep_the_input_size():
 def test_flip_happens_half_of_the_time_and_everything_is_a_function_of_the_generator():
     settings = config.Augment(brightness=0, contrast=0, saturation=0, hue=0)
     centers = [
-        A.augment(frames(), camera(), ids(), settings, generator(s)).K_33[0, 2] for s in range(100)
+        augment(frames(), camera(), ids(), settings, generator(s)).K_33[0, 2] for s in range(100)
     ]
     flipped = sum(bool(center != camera()[0, 2]) for center in centers)
     assert 30 < flipped < 70
     one, two = (
-        A.augment(frames(), camera(), ids(), config.Augment(crop=(20, 20)), generator(9))
+        augment(frames(), camera(), ids(), config.Augment(crop=(20, 20)), generator(9))
         for _ in range(2)
     )
     assert torch.equal(one.jittered_N3HW, two.jittered_N3HW)
-    assert torch.equal(one.instance_ids_HW, two.instance_ids_HW)
+    assert torch.equal(one.static_HW, two.static_HW)
 
 
 # --- shortcuts, which must not change a bit -------------------------------------------------------
@@ -226,14 +249,14 @@ def test_flip_happens_half_of_the_time_and_everything_is_a_function_of_the_gener
 @pytest.mark.parametrize("factor", [0.4, 0.6875, 1.0, 1.37, 2.0])
 def test_a_window_of_a_resized_frame_is_that_part_of_it(size, factor):
     picture, labels = frames(*size), ids(*size)
-    whole, K, whole_labels = A.resize(picture, camera(), labels, factor)
+    whole, K, whole_labels = resize(picture, camera(), labels, factor)
     height, width = whole.shape[-2:]
     channels_last = [frame.permute(1, 2, 0).contiguous().permute(2, 0, 1) for frame in picture]
     for top in (0, height // 3, height - 7):
         for left in (0, width // 2, width - 9):
             window = (slice(top, top + 7), slice(left, left + 9))
             for given in (picture, channels_last):
-                part, part_K, part_labels = A.resize(given, camera(), labels, factor, window)
+                part, part_K, part_labels = resize(given, camera(), labels, factor, window)
                 assert torch.equal(part, whole[..., window[0], window[1]])
                 assert torch.equal(part_labels, whole_labels[window])
                 assert torch.equal(part_K, A.shift(K, -left, -top))
@@ -271,3 +294,111 @@ def test_jitter_is_kornias_changes_one_after_another():
             )[kind](expected, factor)
         expected = expected.unflatten(1, (3, -1)).transpose(0, 1)
         torch.testing.assert_close(A.jitter(picture, settings, generator(seed)), expected)
+
+
+# --- by the kind of a field -----------------------------------------------------------------------
+
+FIELDS = {
+    "ids": Kind.IDS,
+    "depth": Kind.DEPTH,
+    "inverse": Kind.INVERSE_DEPTH,
+    "normals": Kind.NORMALS,
+    "mask": Kind.MASK,
+    "vector": Kind.VECTOR,
+}
+
+
+def fields(height=24, width=40):
+    source = generator(5)
+    return {
+        "ids": ids(height, width),
+        "depth": torch.rand(height, width, generator=source) + 1,
+        "inverse": torch.rand(height, width, generator=source) + 1,
+        "normals": torch.nn.functional.normalize(
+            torch.randn(3, height, width, generator=source), dim=0
+        ),
+        "mask": torch.rand(height, width, generator=source) < 0.5,
+        "vector": torch.rand(7, generator=source),
+    }
+
+
+def view_of(settings, seed=0, of=None):
+    given = of or fields()
+    labels = given["ids"]
+    shape = tuple(labels.shape)
+    return A.augment(frames(*shape), camera(), labels, given, FIELDS, settings, generator(seed))
+
+
+def flipped_view(of=None):
+    views = (view_of(replace(PLAIN, flip=True), seed, of) for seed in range(20))
+    return next(view for view in views if view.K_33[0, 2] != camera()[0, 2])
+
+
+def test_a_flip_mirrors_every_map_and_turns_normals_around():
+    before, after = fields(), flipped_view().fields
+    for name in ("ids", "depth", "inverse", "mask"):
+        assert torch.equal(after[name], before[name].flip(-1)), name
+        assert after[name].dtype == before[name].dtype
+    x, y, z = before["normals"].flip(-1)
+    assert torch.equal(after["normals"], torch.stack([-x, y, z]))
+    assert torch.equal(after["vector"], before["vector"])
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.5, 3.0])
+def test_a_zoom_brings_things_nearer(factor):
+    """What is shown `factor` times as large is `factor` times as near; directions stay."""
+    before = fields()
+    settings = replace(PLAIN, scales=(factor,), crop=(round(24 * factor), round(40 * factor)))
+    view = view_of(settings)
+    nearest = {
+        name: resize(frames(), camera(), before[name], factor)[2]
+        for name in ("ids", "depth", "inverse", "mask")
+    }
+    assert torch.equal(view.fields["ids"], nearest["ids"])
+    assert torch.equal(view.fields["mask"], nearest["mask"])
+    assert torch.equal(view.fields["depth"], nearest["depth"] / factor)
+    assert torch.equal(view.fields["inverse"], nearest["inverse"] * factor)
+    rows = [resize(frames(), camera(), axis, factor)[2] for axis in before["normals"]]
+    assert torch.equal(view.fields["normals"], torch.stack(rows))
+    assert torch.equal(view.fields["vector"], before["vector"])
+    torch.testing.assert_close(view.K_33[0, 0], camera()[0, 0] * factor)
+
+
+def test_a_crop_shows_the_same_window_of_every_map():
+    before = fields()
+    for seed in range(5):
+        view = view_of(replace(PLAIN, crop=(10, 16)), seed)
+        left = round(float(camera()[0, 2] - view.K_33[0, 2]))
+        top = round(float(camera()[1, 2] - view.K_33[1, 2]))
+        for name in ("ids", "depth", "inverse", "normals", "mask"):
+            window = before[name][..., top : top + 10, left : left + 16]
+            assert torch.equal(view.fields[name], window), name
+        assert torch.equal(view.fields["vector"], before["vector"])
+
+
+def test_padding_has_no_value_of_any_kind():
+    before = fields()
+    view = view_of(replace(PLAIN, crop=(40, 60)), 3)
+    left = round(float(view.K_33[0, 2] - camera()[0, 2]))
+    top = round(float(view.K_33[1, 2] - camera()[1, 2]))
+    inside = torch.zeros(40, 60, dtype=torch.bool)
+    inside[top : top + 24, left : left + 40] = True
+    nothing = {"ids": OUTSIDE, "depth": 0, "inverse": 0, "normals": 0, "mask": False}
+    for name, value in nothing.items():
+        found = view.fields[name]
+        assert found.shape[-2:] == (40, 60)
+        assert found.dtype == before[name].dtype
+        assert torch.equal(found[..., inside], before[name].flatten(-2)), name
+        assert (found[..., ~inside] == value).all(), name
+    assert torch.equal(view.static_HW, view.fields["ids"])
+    assert torch.equal(view.fields["vector"], before["vector"])
+
+
+def test_images_without_a_camera_are_augmented_too():
+    settings = config.Augment(scales=(0.5, 2.0), crop=(30, 30))
+    for seed in range(4):
+        with_camera = augment(frames(), camera(), ids(), settings, generator(seed))
+        without = augment(frames(), None, ids(), settings, generator(seed))
+        assert without.K_33 is None
+        assert torch.equal(without.jittered_N3HW, with_camera.jittered_N3HW)
+        assert torch.equal(without.static_HW, with_camera.static_HW)

@@ -8,6 +8,7 @@ import torch
 from cityscapes_tree import (
     CAMERA,
     HEIGHT,
+    LOSS,
     WIDTH,
     file,
     instance_ids,
@@ -19,9 +20,9 @@ from cityscapes_tree import (
 )
 
 from mtl_bench.core import config
+from mtl_bench.core.labels import IGNORE
 from mtl_bench.data.check import check
 from mtl_bench.data.cityscapes_files import neighbour, read_instance_ids, unlabelled_names
-from mtl_bench.core.labels import IGNORE
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
@@ -65,13 +66,12 @@ def test_training_sample_without_changes_shows_the_files(tree):
     )
     assert sample.camera.height_m_B.item() == pytest.approx(1.22)
     assert sample.camera.pitch_rad_B.item() == pytest.approx(0.038)
-    assert "instance_ids" not in sample.fields
     assert "depth_m" not in sample.fields
 
     ids = instance_ids()
     masked = np.isin(ids, [1, 23])
     assert np.array_equal(sample.fields["reprojection_mask"].numpy(), ~masked)
-    targets = panoptic_targets(ids.astype(np.int32), CITYSCAPES20, dataset.loss)
+    targets = panoptic_targets(ids.astype(np.int32), CITYSCAPES20, LOSS)
     assert np.array_equal(sample.fields["semantic"].numpy(), targets.semantic)
     assert np.array_equal(sample.fields["semantic_weight"].numpy(), targets.semantic_weight)
     assert np.array_equal(sample.fields["center"][0].numpy(), targets.center)
@@ -94,17 +94,16 @@ def test_padding_counts_nowhere(tree):
 
 
 def test_evaluation_sample(tree):
-    for augment in (None, config.Augment()):
-        sample = open_tree(tree, augment=augment).sample(0, None)
-        expected = rgb(file(tree, "leftImg8bit", NAME, "leftImg8bit.png"))
-        assert torch.equal(sample.image_B3HW, expected)
-        assert np.array_equal(sample.fields["instance_ids"].numpy(), instance_ids())
-        assert sample.fields["instance_ids"].dtype == torch.int32
-        assert sample.fields["depth_m"].dtype == torch.float32
-        assert sample.fields["depth_m"][5, 5].item() == pytest.approx(23.678742, abs=1e-5)
-        assert sample.fields["depth_m"][0, :2].tolist() == [0, 0]
-        assert "neighbours" not in sample.fields
-        assert "semantic" not in sample.fields
+    sample = open_tree(tree, augment=None).sample(0, None)
+    expected = rgb(file(tree, "leftImg8bit", NAME, "leftImg8bit.png"))
+    assert torch.equal(sample.image_B3HW, expected)
+    assert np.array_equal(sample.fields["instance_ids"].numpy(), instance_ids())
+    assert sample.fields["instance_ids"].dtype == torch.int32
+    assert sample.fields["depth_m"].dtype == torch.float32
+    assert sample.fields["depth_m"][5, 5].item() == pytest.approx(23.678742, abs=1e-5)
+    assert sample.fields["depth_m"][0, :2].tolist() == [0, 0]
+    assert "neighbours" not in sample.fields
+    assert "semantic" not in sample.fields
 
 
 def test_large_frames_shrink_and_ground_truth_keeps_its_size(tmp_path):
@@ -120,7 +119,7 @@ def test_large_frames_shrink_and_ground_truth_keeps_its_size(tmp_path):
     expected = [[2262.52 / 2, 0, (16.98 + 0.5) / 2 - 0.5], [0, 2265.3 / 4, (8.137 + 0.5) / 4 - 0.5]]
     torch.testing.assert_close(sample.camera.K_B33[:2], torch.tensor(expected))
 
-    evaluated = dataset.sample(0, None)
+    evaluated = open_tree(tmp_path, augment=None).sample(0, None)
     assert evaluated.image_B3HW.shape == (3, HEIGHT, WIDTH)
     assert torch.equal(evaluated.camera.K_B33, sample.camera.K_B33)
     assert evaluated.fields["instance_ids"].shape == (4 * HEIGHT, 2 * WIDTH)
@@ -146,7 +145,7 @@ def test_each_task_reads_only_its_files(tree):
     assert "clean" not in sample.fields
     assert "reprojection_mask" not in sample.fields
     assert "semantic" in sample.fields
-    assert panoptic.sample(0, "depth_m" not in None).fields
+    assert "depth_m" not in open_tree(tree, video=False, augment=None).sample(0, None).fields
 
     for folder in ("leftImg8bit_sequence", "disparity"):
         (tree / f"away_{folder}").rename(tree / folder)
@@ -155,7 +154,9 @@ def test_each_task_reads_only_its_files(tree):
     sample = depth.sample(0, generator())
     assert "semantic" not in sample.fields
     assert sample.fields["reprojection_mask"].all()
-    assert depth.sample(0, "instance_ids" not in None).fields
+    assert "instance_ids" not in (
+        open_tree(tree, panoptic=False, augment=None).sample(0, None).fields
+    )
 
     (tree / "away_gtFine").rename(tree / "gtFine")
     sample = open_tree(tree, panoptic=False, augment=PLAIN).sample(0, generator())
@@ -166,7 +167,7 @@ def test_each_task_reads_only_its_files(tree):
 def test_evaluation_needs_no_neighbours(tree):
     for path in (tree / "leftImg8bit_sequence").rglob("*.png"):
         path.unlink()
-    assert open_tree(tree, augment=None).sample(1, "depth_m" in None).fields
+    assert "depth_m" in open_tree(tree, augment=None).sample(1, None).fields
 
 
 def test_cache_changes_nothing_and_saves_reading(tree):
@@ -203,7 +204,7 @@ def test_labelled_sequence_frames_join_the_training(tree, tmp_path_factory):
             put_png(file(tree, "leftImg8bit_sequence", name, "leftImg8bit.png"), image)
         path = pseudo / "aachen" / f"{name}_gtFine_instanceIds.png"
         put_png(path, np.full((HEIGHT, WIDTH), value, np.uint16))
-    dataset = open_tree(tree, sequence_labels=pseudo, augment=PLAIN)
+    dataset = open_tree(tree, further_labels=pseudo, augment=PLAIN)
     assert dataset.names == [
         "aachen_000000_000018",
         "aachen_000000_000019",
@@ -218,7 +219,7 @@ def test_labelled_sequence_frames_join_the_training(tree, tmp_path_factory):
     assert later.camera.K_B33[0, 0].item() == pytest.approx(2262.52)
     human = dataset.sample(1, generator())
     assert (human.fields["semantic"] == CITYSCAPES20.index("car")).any()
-    assert dataset.reprojection_mask == "labels"
+    assert dataset.dataset.static_from == "labels"
 
 
 def test_every_frame_of_a_video_data_set_has_neighbours(tmp_path):
@@ -233,7 +234,7 @@ def test_every_frame_of_a_video_data_set_has_neighbours(tmp_path):
         for frame in range(10, 28):
             path = tmp_path / f"pseudo/aachen/{stem}_{frame:06d}_gtFine_instanceIds.png"
             put_png(path, np.full((HEIGHT, WIDTH), 7, np.uint16))
-    dataset = open_tree(tmp_path, sequence_labels=tmp_path / "pseudo", augment=PLAIN)
+    dataset = open_tree(tmp_path, further_labels=tmp_path / "pseudo", augment=PLAIN)
     assert [name[7:] for name in dataset.names] == [
         *(f"000000_{frame:06d}" for frame in range(16, 23)),
         "000001_000019",
@@ -256,7 +257,7 @@ def test_every_frame_of_a_video_data_set_has_neighbours(tmp_path):
 def test_depth_trains_without_labels_and_panoptic_does_not(tree):
     shutil.rmtree(tree / "gtFine")
     depth = open_tree(tree, panoptic=False)
-    assert (depth.reprojection_mask, depth.needs_automask) == ("none", True)
+    assert (depth.dataset.static_from, depth.dataset.knows_static) == ("none", False)
     for index in range(len(depth)):
         sample = depth.sample(index, generator(index))
         assert sample.fields["reprojection_mask"].all()
@@ -270,11 +271,11 @@ def test_depth_trains_without_labels_and_panoptic_does_not(tree):
 def test_panoptic_alone_needs_no_video_at_all(tree):
     shutil.rmtree(tree / "leftImg8bit_sequence")
     dataset = open_tree(tree, video=False)
-    assert dataset.reprojection_mask == "labels"
+    assert dataset.dataset.static_from == "labels"
     sample = dataset.sample(0, generator())
     assert "semantic" in sample.fields
-    for name in ("context_BN3HW", "clean_B3HW", "clean_context_BN3HW", "reprojection_mask_BHW"):
-        assert getattr(sample, name) is None
+    further = {"neighbours", "clean", "clean_neighbours", "reprojection_mask"}
+    assert not further & sample.fields.keys()
     with pytest.raises(ValueError, match="missing, one of 6 neighbour frames"):
         open_tree(tree)
 
@@ -283,7 +284,7 @@ def test_ego_mask_goes_through_the_augmentation(tree):
     shutil.rmtree(tree / "gtFine")
     ego = put_ego_mask(tree)
     dataset = open_tree(tree, panoptic=False, augment=PLAIN)
-    assert (dataset.reprojection_mask, dataset.needs_automask) == ("ego_mask.png", True)
+    assert (dataset.dataset.static_from, dataset.dataset.knows_static) == ("ego_mask.png", False)
     assert np.array_equal(dataset.sample(0, generator()).fields["reprojection_mask"].numpy(), ~ego)
 
     for path in tree.rglob("*_leftImg8bit.png"):  # so that the image says what the mask must be
@@ -305,15 +306,15 @@ def test_ego_mask_is_for_frames_without_labels(tree):
     ego = put_ego_mask(tree)
     labelled = np.isin(instance_ids(), [1, 23])
     dataset = open_tree(tree, augment=PLAIN)
-    assert (dataset.reprojection_mask, dataset.needs_automask) == ("labels", False)
+    assert (dataset.dataset.static_from, dataset.dataset.knows_static) == ("labels", True)
     assert np.array_equal(
         dataset.sample(0, generator()).fields["reprojection_mask"].numpy(), ~labelled
     )
 
     file(tree, "gtFine", NAME, "gtFine_instanceIds.png").unlink()
     dataset = open_tree(tree, augment=PLAIN, panoptic=False)
-    assert dataset.reprojection_mask == "labels, or ego_mask.png where a frame lacks them"
-    assert dataset.needs_automask
+    assert dataset.dataset.static_from == "labels, or ego_mask.png where a frame lacks them"
+    assert not dataset.dataset.knows_static
     masks = [
         dataset.sample(index, generator()).fields["reprojection_mask"].numpy() for index in (0, 1)
     ]
@@ -322,7 +323,7 @@ def test_ego_mask_is_for_frames_without_labels(tree):
 
     (tree / "ego_mask.png").unlink()
     dataset = open_tree(tree, augment=PLAIN, panoptic=False)
-    assert dataset.reprojection_mask == "labels, or none where a frame lacks them"
+    assert dataset.dataset.static_from == "labels, or none where a frame lacks them"
 
 
 def test_ego_mask_shrinks_with_the_frames(tmp_path):
@@ -352,7 +353,7 @@ def test_wrong_ego_mask(tree, mask, message):
     with pytest.raises(ValueError, match=f"{tree}/ego_mask.png: {message}") as error:
         open_tree(tree, panoptic=False).sample(0, generator())
     assert one_line(error)
-    assert open_tree(tree, panoptic=False, augment=None).sample(0, "depth_m" in None).fields
+    assert "depth_m" in open_tree(tree, panoptic=False, augment=None).sample(0, None).fields
     report = check(tree)
     assert [str(problem) for problem in report.problems] == [str(error.value)]
     assert report.obstacle("depth training") == "1 problem"
@@ -432,7 +433,7 @@ def test_wrong_contents(tree, folder, suffix, array, message):
     path = file(tree, folder, NAME, suffix)
     put_png(path, array)
     with pytest.raises(ValueError, match=f"{path}: {message}") as error:
-        open_tree(tree).sample(0, None)
+        open_tree(tree, augment=None).sample(0, None)
     assert one_line(error)
     assert [str(problem) for problem in check(tree).problems] == [str(error.value)]
 
@@ -474,7 +475,7 @@ def test_truncated_png(tree, keep):
     path.write_bytes(data[:keep])
     message = "truncated PNG|empty|not a PNG"
     with pytest.raises(ValueError, match=f"{path}: .*({message})") as error:
-        open_tree(tree).sample(0, None)
+        open_tree(tree, augment=None).sample(0, None)
     assert one_line(error)
     assert [problem.group for problem in check(tree).problems] == ["bad"]
 
@@ -485,7 +486,7 @@ def test_damaged_png(tree):
     data[len(data) // 2] ^= 255
     path.write_bytes(data)
     with pytest.raises(ValueError, match=f"{path}: damaged PNG"):
-        open_tree(tree).sample(0, None)
+        open_tree(tree, augment=None).sample(0, None)
     assert check(tree).problems == []  # the header is in order
     assert "damaged PNG" in str(check(tree, deep=True).problems[0])
 
@@ -504,14 +505,14 @@ def test_broken_camera(tree, text, message):
     path = file(tree, "camera", NAME, "camera.json")
     path.write_text(text)
     with pytest.raises(ValueError, match=f"{path}: {message}") as error:
-        open_tree(tree).sample(0, None)
+        open_tree(tree, augment=None).sample(0, None)
     assert one_line(error)
     assert [str(problem) for problem in check(tree).problems] == [str(error.value)]
 
 
 def test_frames_smaller_than_the_recipe(tree):
     with pytest.raises(ValueError, match="16x32 pixels, fewer than the recipe's 32x64"):
-        open_tree(tree, data=config.Data(height=32, width=64)).sample(0, None)
+        open_tree(tree, data=config.Data(height=32, width=64), augment=None).sample(0, None)
 
 
 def test_no_data_set_at_all(tmp_path):

@@ -193,9 +193,7 @@ def ablate(tmp_path, monkeypatch):
     runs, built = tmp_path / "runs", []
     (tmp_path / "mine.toml").write_text(GRID)
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
-    monkeypatch.setattr(
-        "mtl_bench.bench.references.measure_trivial", lambda *given, **named: None
-    )
+    monkeypatch.setattr("mtl_bench.bench.references.measure_trivial", lambda *given, **named: None)
 
     def build(grid, rows, out_dir, **given):
         built.append((grid.name, [row["status"] for row in rows], out_dir))

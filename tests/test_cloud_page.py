@@ -11,12 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
+from mtl_bench.core.view import METRES
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.show.figures import Shown, cloud_page
 from mtl_bench.show.figures.cloud_page import POINTS, leveled, page_of, thinned
 from mtl_bench.show.predict import Predicted
 from mtl_bench.show.predict.cameras import Mounted
 from mtl_bench.show.predict.point_cloud import PointCloud
+from mtl_bench.tasks.depth.picture import DepthView, scale_of
+from mtl_bench.tasks.panoptic.picture import PanopticView
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -57,6 +60,10 @@ def browse(page, tmp_path, mode, *options):
     return cv2.imread(str(shot))[..., ::-1], console
 
 
+def page_with(cloud, about=ABOUT):
+    return page_of(cloud, CITYSCAPES20, about, scale_of(cloud.points_N3[:, 2], cloud.unit))
+
+
 def share(picture, color):
     return (np.abs(picture.astype(int) - color).max(-1) <= 3).mean()
 
@@ -67,7 +74,7 @@ def share(picture, color):
     [("Image", (RED, BLUE)), ("Class", (CAR, TREE)), ("Instance", (None, (203, 207, 194)))],
 )
 def test_a_browser_shows_the_points(tmp_path, mode, colors):
-    picture, console = browse(page_of(two_clusters(), CITYSCAPES20, ABOUT), tmp_path, mode, *WEBGL)
+    picture, console = browse(page_with(two_clusters()), tmp_path, mode, *WEBGL)
     assert console == []
     halves = picture[200:, :450], picture[200:, 450:]
     for half, color, other in zip(halves, colors, colors[::-1], strict=True):
@@ -80,7 +87,7 @@ def test_a_browser_shows_the_points(tmp_path, mode, colors):
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_without_webgl_the_page_says_so(tmp_path):
-    page = page_of(two_clusters(), CITYSCAPES20, ABOUT)
+    page = page_with(two_clusters())
     picture, console = browse(page, tmp_path, "Image", "--disable-gpu", "--disable-3d-apis")
     assert share(picture, RED) == share(picture, BLUE) == 0
     assert share(picture, (255, 255, 255)) > 0.9
@@ -89,7 +96,7 @@ def test_without_webgl_the_page_says_so(tmp_path):
 
 
 def test_the_page_asks_for_nothing():
-    page = page_of(two_clusters(), CITYSCAPES20, {**ABOUT, "name": "</script><b>&"})
+    page = page_with(two_clusters(), {**ABOUT, "name": "</script><b>&"})
     code = re.sub(r'<script type="text/plain".*?</script>', "", page)  # but the base64
     assert not re.search(r"https?:|//[a-z]|url\(|import |fetch|XMLHttp|WebSocket", code)
     assert """content="default-src 'none';""" in page
@@ -101,7 +108,7 @@ def test_the_page_asks_for_nothing():
 
 def test_positions_are_kept_to_the_millimetre():
     cloud = two_clusters()
-    page = page_of(cloud, CITYSCAPES20, ABOUT)
+    page = page_with(cloud)
     facts = json.loads(re.search(r'id="facts">(.*?)</script>', page)[1])
     stored = re.search(r'id="positions">(.*?)</script>', page)[1]
     steps = np.frombuffer(base64.b64decode(stored), "<u2").reshape(-1, 3)
@@ -128,11 +135,9 @@ def shown(rows, columns, height=1.5):
     slope = (np.arange(rows) - rows / 4) / columns
     depth = np.where(slope > 0, 1.5 / np.maximum(slope, 1e-4), 0)[:, None].repeat(columns, 1)
     ids = np.where(depth > 0, 7, 23).astype(np.int32)
-    classes = np.where(ids == 7, CITYSCAPES20.index("road"), CITYSCAPES20.index("sky"))
     image = rng.integers(0, 256, (rows, columns, 3)).astype(np.uint8)
-    predicted = Predicted(
-        image, K, ids, classes.astype(np.uint8), depth.astype(np.float32), "m", "road", height
-    )
+    surface = DepthView(depth.astype(np.float32), METRES, "road", height)
+    predicted = Predicted(image, K, (PanopticView(ids, CITYSCAPES20), surface))
     return Shown("frame", predicted, Mounted(K, height, 0.0, "test"), CITYSCAPES20)
 
 
@@ -154,7 +159,7 @@ def test_tiny_frames_get_points_in_between():
 
 def test_without_depth_there_is_no_page():
     frame = shown(64, 128)
-    bare = replace(frame.predicted, depth_HW=None, unit=None)
+    bare = replace(frame.predicted, views=frame.predicted.views[:1])
     with pytest.raises(ValueError, match="no depth is predicted"):
         cloud_page(replace(frame, predicted=bare), "a run")
 

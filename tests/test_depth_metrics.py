@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mtl_bench.core import config
-from mtl_bench.tasks.depth.errors import (
+from mtl_bench.tasks.depth.metrics import (
     NAMES,
     DepthErrors,
     depth_errors,

@@ -13,16 +13,20 @@ from cityscapesscripts.evaluation import evalPanopticSemanticLabeling as csEval
 from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 
+from mtl_bench.bench.stored import export_predictions
 from mtl_bench.core.config import Cell, Data, Evaluate, Loss, Recipe
 from mtl_bench.core.labels import IGNORE
+from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
-from mtl_bench.data.loader import eval_batches, open_dataset
-from mtl_bench.evaluate.export_predictions import export_predictions, write_panoptic
-from mtl_bench.evaluate.trivial import Average, baselines
-from mtl_bench.evaluate.walk import evaluate
+from mtl_bench.data.loader import eval_batches
+from mtl_bench.data.samples import open_samples
+from mtl_bench.evaluate.trivial import baselines
+from mtl_bench.evaluate.walk import evaluate, frame_truth, predict
 from mtl_bench.model import Outputs
-from mtl_bench.tasks.panoptic import postprocess
-from mtl_bench.tasks.panoptic.quality import PanopticQuality
+from mtl_bench.tasks.depth import MeanDepth
+from mtl_bench.tasks.panoptic import MostFrequentClass, grouping
+from mtl_bench.tasks.panoptic.files import write_panoptic
+from mtl_bench.tasks.panoptic.metrics import PanopticQuality
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 HEIGHT, WIDTH, FRAMES = 64, 128, 5
@@ -92,6 +96,7 @@ class Oracle(nn.Module):
     def __init__(self, cell, unit=3.0, change=None):
         super().__init__()
         self.cell, self.unit, self.change = cell, unit, change
+        self.tasks = tasks_of_cell(cell)
         self.weight = nn.Parameter(torch.ones(1))
         self.frozen = nn.BatchNorm2d(1).eval()
         self.net = self.answer
@@ -101,15 +106,12 @@ class Oracle(nn.Module):
         assert torch.is_inference_mode_enabled()
         step = HEIGHT // image_B3HW.shape[2]
         parts = [self.frame(round(image[0, 0, 0].item() * 255), step) for image in image_B3HW]
-        outputs = Outputs()
-        if "panoptic" in self.cell.tasks:
-            names = ("semantic_BCHW", "center_B1HW", "offset_B2HW")
-            for name, maps in zip(
-                names, zip(*[part[:3] for part in parts], strict=True), strict=True
-            ):
-                setattr(outputs, name, torch.stack(maps))
-        if "depth" in self.cell.tasks:
-            outputs.inverse_depth = [torch.stack([part[3] for part in parts])]
+        *panoptic, inverse = map(torch.stack, zip(*parts, strict=True))
+        every = {
+            "panoptic": dict(zip(("semantic", "center", "offset"), panoptic, strict=True)),
+            "depth": {"inverse": inverse},
+        }
+        outputs = Outputs({task: every[task] for task in self.cell.tasks})
         return self.change(outputs) if self.change else outputs
 
     def frame(self, index, step):
@@ -176,7 +178,7 @@ def test_the_worst_and_the_best_frame_are_kept(root):
 
     def spoiled(outputs):
         """Sky all over frame 3, and in the upper half of frame 1."""
-        for semantic in outputs.semantic_BCHW:
+        for semantic in outputs.maps["panoptic"]["semantic"]:
             rows = {1: HEIGHT // 2, 3: HEIGHT}.get(next(numbers), 0)
             semantic[:, :rows] = 0
             semantic[CITYSCAPES20.index("sky"), :rows] = 9
@@ -208,7 +210,7 @@ def test_one_task_has_no_numbers_of_the_other(root):
 
 def test_frames_without_ground_are_counted_not_averaged(root):
     def wall(outputs):
-        outputs.inverse_depth[0][0] = 0.1  # the first frame of each batch
+        outputs.maps["depth"]["inverse"][0] = 0.1  # the first frame of each batch
         return outputs
 
     cell = replace(CELL, tasks=("depth",))
@@ -220,7 +222,7 @@ def test_frames_without_ground_are_counted_not_averaged(root):
     assert metrics["depth_median.abs_rel"] > 0.1
 
     def walls(outputs):
-        outputs.inverse_depth[0][:] = 0.1
+        outputs.maps["depth"]["inverse"][:] = 0.1
         return outputs
 
     metrics = run(cell, root, change=walls).metrics
@@ -243,11 +245,52 @@ def test_smaller_inputs_are_compared_at_the_size_of_the_truth(root):
 
 def test_depth_that_is_not_finite_is_an_error(root):
     def broken(outputs):
-        outputs.inverse_depth[0][0, 0, 3, 3] = torch.nan
+        outputs.maps["depth"]["inverse"][0, 0, 3, 3] = torch.nan
         return outputs
 
     with pytest.raises(ValueError, match="not finite in a frame of \\['aachen_000000_000019'"):
         run(CELL, root, change=broken)
+
+
+@pytest.mark.parametrize("first_part", [0, 2, 4])
+def test_the_states_of_two_parts_of_a_split_add_up_to_the_whole(root, first_part):
+    """As ranks do that share a split."""
+    numbers = iter(range(FRAMES))
+
+    def shaken(outputs):
+        """Moved by more in every frame; nowhere in the third is ground."""
+        number = next(numbers)
+        panoptic, inverse = outputs.maps["panoptic"], outputs.maps["depth"]["inverse"]
+        panoptic["semantic"] = panoptic["semantic"].roll((number, number + 1), (2, 3))
+        outputs.maps["depth"]["inverse"] = inverse * torch.linspace(0.8, 1.2 + number / 10, WIDTH)
+        if number == 2:
+            outputs.maps["depth"]["inverse"] = torch.full_like(inverse, 0.1)
+            panoptic["semantic"] = panoptic["semantic"].roll(3, 1)
+        return outputs
+
+    model = Oracle(CELL, change=shaken).eval()
+    samples = open_samples(CELL.recipe, model.tasks, "val", root, training=False)
+    with torch.inference_mode():
+        frames = [(batch, predict(model, batch, model.tasks)) for batch in eval_batches(samples, 1)]
+    metrics = {}
+    for task in model.tasks:
+        whole, first, second, total = (task.metrics()[0] for _ in range(4))
+        for index, (batch, found) in enumerate(frames):
+            truth = frame_truth(task, batch, 0)
+            result = {name: value[0].numpy() for name, value in found[task.name].items()}
+            whole.update(truth, result)
+            (first if index < first_part else second).update(truth, result)
+        for part in (first, second):
+            before = part.compute()
+            total.add(part.state())
+            assert part.compute() == before
+        assert total.compute() == pytest.approx(whole.compute(), rel=1e-12)
+        assert list(total.compute()) == list(whole.compute())
+        assert total.record() == whole.record()
+        metrics |= whole.compute()
+    assert 0 < metrics["panoptic.pq"] < 100
+    assert metrics["depth_median.abs_rel"] > 0.01
+    assert metrics["dgc.failed"] == 1
 
 
 # --- trivial predictors ---------------------------------------------------------------------------
@@ -285,14 +328,19 @@ def test_baselines_are_averages_of_the_training_split(root, tmp_path):
 
 
 def test_averages_of_two_frames_by_hand():
-    average = Average(CITYSCAPES19, Evaluate(), (1, 4))
-    average.add(torch.tensor([[7, 7, 26001, 1]]), torch.tensor([[10.0, 0, 90, 0]]))
-    average.add(torch.tensor([[7, 8, 26, 0]]), torch.tensor([[30.0, 0, 0, 8]]))
-    names = [CITYSCAPES19.labels[i].name for i in average.class_HW()[0, :3]]
+    most, mean = MostFrequentClass(CITYSCAPES19, Recipe(), (1, 4)), MeanDepth(Evaluate(), (1, 4))
+    for ids, depth_m in (
+        ([[7, 7, 26001, 1]], [[10.0, 0, 90, 0]]),
+        ([[7, 8, 26, 0]], [[30.0, 0, 0, 8]]),
+    ):
+        frame = {"instance_ids": np.array(ids), "depth_m": np.array(depth_m)}
+        most.add(frame)
+        mean.add(frame)
+    names = [CITYSCAPES19.labels[i].name for i in most.class_HW()[0, :3]]
     assert names == ["road", "road", "car"]
-    assert average.class_HW()[0, 3] == IGNORE
-    assert average.depth_m_HW()[0, [0, 3]].tolist() == [20.0, 8.0]
-    assert average.depth_m_HW()[0, 1:3].tolist() == [20.0, 8.0]  # no valid depth: the nearest
+    assert most.class_HW()[0, 3] == IGNORE
+    assert mean.depth_m_HW()[0, [0, 3]].tolist() == [20.0, 8.0]
+    assert mean.depth_m_HW()[0, 1:3].tolist() == [20.0, 8.0]  # no valid depth: the nearest
 
 
 def test_baselines_are_computed_once_per_setting(root, tmp_path):
@@ -328,13 +376,15 @@ def test_baselines_of_one_task_need_no_truth_of_the_other(root, tmp_path):
 
 def test_the_official_evaluator_agrees_on_exported_predictions(root, tmp_path):
     def blur(outputs):
-        outputs.semantic_BCHW = outputs.semantic_BCHW.roll((2, 3), (2, 3))
-        outputs.fields["center"][1:, :, :, :64] = 0  # loses a car
+        maps = outputs.maps["panoptic"]
+        maps["semantic"] = maps["semantic"].roll((2, 3), (2, 3))
+        maps["center"][1:, :, :, :64] = 0  # loses a car
         return outputs
 
     model = Oracle(CELL, change=blur)
-    expected = evaluate(model, CELL, root, CPU, batch_size=2).metrics
-    results = export_predictions(model, CELL, root, tmp_path / "out", CPU, batch_size=2)
+    expected = evaluate(model, CELL, root, CPU).metrics
+    export_predictions(model, CELL, root, tmp_path / "out", CPU)
+    results = tmp_path / "out" / "cityscapes_panoptic_val.json"
     convert2panoptic(str(root / "gtFine"), str(tmp_path), setNames=["val"])
     official = official_quality(tmp_path / "cityscapes_panoptic_val.json", results)
     assert 0 < official["All"]["pq"] < 1
@@ -359,15 +409,15 @@ def official_quality(truth_json: Path, results_json: Path):
 def truth_through_grouping(root, cell, damage):
     """(name, predicted ids, true ids) of the split: truth -> targets -> grouping."""
     ev = replace(cell.recipe.evaluate, stuff_area=0)
-    dataset = open_dataset(cell, "val", root, training=False)
-    for batch in eval_batches(dataset, 1):
+    samples = open_samples(cell.recipe, tasks_of_cell(cell), "val", root, training=False)
+    for batch in eval_batches(samples, 1):
         ids = batch.fields["instance_ids"][0].numpy()
         targets = panoptic_targets(ids, CITYSCAPES20, cell.recipe.loss)
         classes = np.where((ids > 23) & (ids < 1000), IGNORE, targets.semantic)  # crowds
         classes = np.roll(classes, damage, 1)
         maps = [torch.from_numpy(x)[None] for x in (classes, targets.center[None], targets.offset)]
-        panoptic = postprocess.panoptic(*maps, CITYSCAPES20.things, ev)
-        predicted = postprocess.to_instance_ids(panoptic, CITYSCAPES20)[0].numpy()
+        panoptic = grouping.panoptic(*maps, CITYSCAPES20.things, ev)
+        predicted = grouping.to_instance_ids(panoptic, CITYSCAPES20)[0].numpy()
         yield batch.names[0], predicted, ids
 
 
@@ -388,5 +438,5 @@ def test_the_built_in_truth_is_perfect_and_the_official_evaluator_agrees(
 
 def test_nothing_panoptic_nothing_to_export(root, tmp_path):
     cell = replace(CELL, tasks=("depth",))
-    with pytest.raises(ValueError, match="no panoptic task"):
+    with pytest.raises(ValueError, match=r"no task of cell .* has results to export"):
         export_predictions(Oracle(cell), cell, root, tmp_path, CPU)

@@ -1,7 +1,7 @@
 """Figures of predictions: what is on them, that they are legible, and that they stay the same."""
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,13 +11,15 @@ from kitti_tree import write_tree
 from test_cloud_page import shown
 from typer.testing import CliRunner
 
-from mtl_bench.core.files import write_json
 from mtl_bench.cli.app import app
+from mtl_bench.core import canvas
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.device import Engine
-from mtl_bench.data.labels import labels_of
+from mtl_bench.core.files import write_json
+from mtl_bench.core.view import Key, View
 from mtl_bench.show import figures
 from mtl_bench.show.figures import printed
+from mtl_bench.show.predict import files
 from mtl_bench.train import checkpoint
 from mtl_bench.train.loop import build
 
@@ -33,8 +35,9 @@ def texts(figure):
     return found
 
 
-def without(one, *fields):
-    return replace(one, predicted=replace(one.predicted, **dict.fromkeys(fields)))
+def only(one, *tasks):
+    views = tuple(view for view in one.predicted.views if view.task in tasks)
+    return replace(one, predicted=replace(one.predicted, views=views))
 
 
 def drawn(figure, path):
@@ -87,22 +90,59 @@ def test_rows_of_one_frame_show_their_input_once():
 
 
 @pytest.mark.parametrize(
-    ("absent", "panels"),
+    ("task", "panels"),
     [
-        (("depth_HW", "unit", "camera_height"), ["Input", "Panoptic segmentation"]),
-        (("instance_ids_HW", "class_HW"), ["Input", "Depth [m]", "Point cloud"]),
+        ("panoptic", ["Input", "Panoptic segmentation"]),
+        ("depth", ["Input", "Depth [m]", "Point cloud"]),
     ],
 )
-def test_what_a_cell_lacks_has_no_panel(absent, panels, tmp_path):
-    one = without(shown(64, 128), *absent)
+def test_what_a_cell_lacks_has_no_panel(task, panels, tmp_path):
+    one = only(shown(64, 128), task)
     for figure in (figures.prediction(one, 60), figures.qualitative([one], [""], 60)):
         assert [text.get_text() for text in figure.texts][: len(panels)] == panels
         drawn(figure, tmp_path / "a.png")
 
 
+@dataclass(frozen=True)
+class Tint(View):
+    """What a third task might show."""
+
+    task = "tint"
+    share_HW: np.ndarray
+
+    def picture(self, image_HW3):
+        share_HW = canvas.nearest(self.share_HW, image_HW3)
+        return np.uint8(image_HW3 * share_HW[..., None])
+
+    def explained(self, image_HW3, whole=False):
+        return self.picture(image_HW3)
+
+    def files(self, kind, image_HW3):
+        return {"tint": self.picture(image_HW3)} if kind == "tint" else {}
+
+    @classmethod
+    def key(cls, views):
+        return Key("Tint", {"dark": (0, 0, 0)})
+
+
+def test_a_third_task_is_shown_with_no_edit_elsewhere(tmp_path):
+    one = shown(64, 128)
+    views = (*one.predicted.views, Tint(np.zeros((64, 128), np.float32)))
+    one = replace(one, predicted=replace(one.predicted, views=views))
+    words = [text for text, _ in texts(figures.prediction(one, 60))]
+    assert words[2:5] == ["Depth [m]", "Tint", "Point cloud"]
+    assert "dark" in words
+    files.write_files(tmp_path / "a", one.predicted, ["tint"], one.labels)
+    assert [path.name for path in tmp_path.iterdir()] == ["a_tint.png"]
+    assert files.video_frame(one.predicted).shape[1] == 640 + 8 + 640 + 8 + 128
+    assert files.denser(one.predicted, 2).views[2].share_HW.shape == (128, 256)
+
+
 def test_depth_without_a_scale_has_no_numbers():
     one = shown(64, 128)
-    one = replace(one, predicted=replace(one.predicted, unit="network units", camera_height=None))
+    segments, surface = one.predicted.views
+    unscaled = replace(surface, unit="network units", camera_height=None)
+    one = replace(one, predicted=replace(one.predicted, views=(segments, unscaled)))
     words = [text for text, _ in texts(figures.prediction(one, 60))]
     assert {"near", "far"} <= set(words)
     assert "10" not in words
@@ -155,7 +195,7 @@ def run_dir(tmp_path_factory):
     cell = Cell(load_recipe("smoke"), backbone="tiny", method="fixed_uncertainty")
     folder = tmp_path_factory.mktemp("runs") / cell.slug
     folder.mkdir()
-    model = build(cell, labels_of("synthetic"), Engine(torch.device("cpu"), "fp32"))[0]
+    model = build(cell, Engine(torch.device("cpu"), "fp32"))[0]
     torch.save({"format": checkpoint.FORMAT, "model": model.state_dict()}, folder / "last.pt")
     write_json(folder / "cell.json", to_dict(cell))
     return folder

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from textwrap import dedent
 
@@ -329,10 +330,7 @@ def test_helpers_of_members_count_with_those(task):
 @pytest.fixture(scope="module")
 def reached():
     """Files that any stage of a cell reaches."""
-    roots = {
-        stage: [*found, provenance.backbone_root("tiny")]
-        for stage, found in provenance.harness_roots(video=True).items()
-    }
+    roots = provenance.roots(Cell(Recipe(), "tiny", "pcgrad", video=True))
     return {stage: fingerprint.reach(stage, found) for stage, found in roots.items()}
 
 
@@ -342,14 +340,16 @@ def names(reached, file):
 
 def test_each_stage_has_what_it_runs(reached):
     assert {"Engine", "initial_weights", "seed_for"} <= names(reached["train"], "core.device")
-    assert "photometric_loss" in names(reached["train"], "tasks.depth.photometric")
-    assert "ensure" in names(reached["train"], "evaluate.pseudo_labels")
-    assert "PanopticQuality" in names(reached["evaluate"], "tasks.panoptic.quality")
-    assert not names(reached["evaluate"], "tasks.depth.photometric")
-    assert "measure" in names(reached["time"], "latency")
-    assert not names(reached["time"], "tasks.panoptic.quality")
-    for found in reached.values():
-        assert "Network" in names(found, "model.network")
+    assert "photometric_loss" in names(reached["train"], "tasks.depth.losses")
+    assert "label" in names(reached["label"], "tasks.panoptic.pseudo_labels")
+    assert "PanopticQuality" in names(reached["evaluate"], "tasks.panoptic.metrics")
+    assert not names(reached["evaluate"], "tasks.depth.losses")
+    assert "time_cell" in names(reached["time"], "bench.stored")
+    assert "measure" in {name for path, name in reached["time"] if path.stem == "latency"}
+    assert not names(reached["time"], "tasks.panoptic.metrics")
+    for stage in fingerprint.STAGES:
+        assert "Network" in names(reached[stage], "model.network")
+        assert "CITYSCAPES20" in names(reached[stage], "data.labels")
 
 
 PROBE = """
@@ -382,10 +382,21 @@ def copied(tmp_path, monkeypatch):
     """A copy of the package that can be edited; says which stages of a cell an edit is seen in."""
     package = tmp_path / "mtl_bench"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    for folder in plugins.KINDS:
+    for folder in ("methods", "backbones"):
         shutil.copytree(PACKAGE.parent / folder, tmp_path / folder)
+
+    def moved(path):
+        return package / path.relative_to(PACKAGE)
+
     monkeypatch.setattr(fingerprint, "PACKAGE", package)
     monkeypatch.setattr(plugins, "PACKAGE", package)
+    shipped = {kind: moved(folder) for kind, folder in plugins.SHIPPED.items()}
+    monkeypatch.setattr(plugins, "SHIPPED", shipped)
+    begins = {
+        stage: [replace(root, path=moved(root.path)) for root in found]
+        for stage, found in provenance.HARNESS_ROOTS.items()
+    }
+    monkeypatch.setattr(provenance, "HARNESS_ROOTS", begins)
     monkeypatch.chdir(tmp_path)
     fingerprint.excluded.cache_clear()
     fingerprint._module_file.cache_clear()
@@ -401,6 +412,7 @@ def copied(tmp_path, monkeypatch):
         path.write_text(text)
         return changed
 
+    seen.package = package
     yield seen
     fingerprint.excluded.cache_clear()
     fingerprint._module_file.cache_clear()
@@ -413,16 +425,16 @@ def test_edits_are_seen_by_the_stages_that_they_concern(copied):
     harness, method = "harness changed", "method changed"
     assert copied("mtl_bench/train/loop.py", "to be read from top to bottom", "reworded") == {}
     assert copied("methods/pcgrad.py", '"""', '"""Reworded. ') == {}
-    file = "mtl_bench/tasks/depth/smoothness.py"
+    file = "mtl_bench/tasks/depth/losses.py"
     loss = (file, "def smoothness_loss(", "X = 1\ndef smoothness_loss(")
     assert copied(*loss) == {}  # nobody uses it
     assert copied("methods/pcgrad.py", "class PCGrad", "class PCGrad2") == {"train": method}
     assert copied("methods/_solvers.py", "def finite(", "def finite(more=1, *") == {"train": method}
-    where = "mtl_bench/tasks/panoptic/semantic_loss.py"
+    where = "mtl_bench/tasks/panoptic/losses.py"
     assert copied(where, "def semantic_loss(", "@staticmethod\ndef semantic_loss(") == {
         "train": harness
     }
-    where = "mtl_bench/tasks/panoptic/iou.py"
+    where = "mtl_bench/tasks/panoptic/metrics.py"
     assert copied(where, "class SemanticIoU", "@staticmethod\nclass SemanticIoU") == {
         "evaluate": harness
     }
@@ -430,3 +442,17 @@ def test_edits_are_seen_by_the_stages_that_they_concern(copied):
         "backbone changed"
     }
     assert copied("mtl_bench/core/device.py", "self.scaler.update()", "pass") == {"train": harness}
+
+
+def test_what_a_table_says_and_a_further_task_are_no_stages_matter(copied):
+    depth = "mtl_bench/tasks/depth/__init__.py"
+    assert copied(depth, '"AbsRel", -1, 3', '"Abs Rel", -1, 4') == {}
+    assert (
+        copied(
+            depth, "    columns = (\n", "    columns = (\n        Column('x', 'x', 'x', 1, 1),\n"
+        )
+        == {}
+    )
+    with_third = copied.package / "tasks" / "third.py"
+    with_third.write_text("from mtl_bench.core.task import Task\n\nclass Third(Task):\n    pass\n")
+    assert copied("mtl_bench/train/loop.py", "to be read from top to bottom", "reworded") == {}

@@ -7,9 +7,13 @@ import pytest
 import torch
 
 from mtl_bench.core import config, geometry
+from mtl_bench.core.batch import Camera
+from mtl_bench.core.task import finish as finish_tasks
+from mtl_bench.core.task import tasks_of
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.tasks.finish import Finish
-from mtl_bench.tasks.panoptic import postprocess
+from mtl_bench.tasks.depth import scale
+from mtl_bench.tasks.depth.scale import dgc_scale
+from mtl_bench.tasks.panoptic import grouping
 
 THINGS = CITYSCAPES20.things
 ROAD, SKY, EGO = (CITYSCAPES20.index(name) for name in ("road", "sky", "ego vehicle"))
@@ -18,8 +22,29 @@ SETTINGS = config.Evaluate(stuff_area=60, nms_kernel=5, top_k=40)
 NAMES = ("semantic", "center", "offset", "inverse", "K", "camera_height", "pitch")
 
 
+class Finish(torch.nn.Module):
+    """What tasks make of maps, and points; a task whose maps are None is not there."""
+
+    def forward(self, semantic, center, offset, inverse, K, camera_height, pitch):
+        maps = {}
+        if semantic is not None:
+            maps["panoptic"] = {"semantic": semantic, "center": center, "offset": offset}
+        if inverse is not None:
+            maps["depth"] = {"inverse": inverse}
+        tasks = tasks_of(config.Recipe(evaluate=SETTINGS), maps, CITYSCAPES20)
+        camera = Camera(K, camera_height, pitch)
+        done = finish_tasks(tasks, maps, camera)
+        found = {}
+        if semantic is not None:
+            found["panoptic"] = done["panoptic"]["panoptic"]
+        if inverse is not None:
+            found["depth_m"] = done["depth"]["depth_m"]
+            found["points"] = tasks[-1].points(done, camera)
+        return found
+
+
 def finish() -> Finish:
-    return Finish(THINGS, ROAD, SETTINGS, (EGO, SKY)).eval()
+    return Finish().eval()
 
 
 def inputs(seed: int, case: str = "plain") -> tuple[torch.Tensor, ...]:
@@ -63,19 +88,15 @@ CASES = ("plain", "ties", "far", "no centers", "no things", "no road", "wall")
 def test_it_is_the_functions_one_after_the_other(case):
     logits, heat, offset, inverse, K, camera_height, pitch = given = inputs(0, case)
     result = finish()(*given)
-    panoptic = postprocess.panoptic(logits, heat, offset, THINGS, SETTINGS)
+    panoptic = grouping.panoptic(logits, heat, offset, THINGS, SETTINGS)
     assert result["panoptic"].dtype == torch.int32
     assert torch.equal(result["panoptic"].long(), panoptic)
 
     depth = geometry.depth_from_inverse(inverse)
     classes = logits.argmax(1)
-    scale, source = postprocess.dgc_scale(
-        depth, K, camera_height, classes == ROAD, pitch_rad_B=pitch
-    )
-    assert source.item() == {"no road": postprocess.NORMALS, "wall": postprocess.FAILED}.get(
-        case, postprocess.ROAD
-    )
-    depth_m = depth * scale[:, None, None, None]
+    factor, source = dgc_scale(depth, K, camera_height, classes == ROAD, pitch_rad_B=pitch)
+    assert source.item() == {"no road": scale.NORMALS, "wall": scale.FAILED}.get(case, scale.ROAD)
+    depth_m = depth * factor[:, None, None, None]
     torch.testing.assert_close(result["depth_m"], depth_m, equal_nan=True, rtol=0, atol=0)
 
     points = geometry.back_project(depth_m, K)
@@ -95,13 +116,13 @@ def test_classes_do_for_logits():
 def test_each_task_alone():
     given = inputs(2)
     both = finish()(*given)
-    alone = finish()(*given[:3])
+    alone = finish()(*given[:3], *[None] * 4)
     assert set(alone) == {"panoptic"}
     assert torch.equal(alone["panoptic"], both["panoptic"])
     depth = finish()(None, None, None, *given[3:])
     assert set(depth) == {"depth_m", "points"}
     assert depth["points"].isfinite().all()
-    level = finish()(None, None, None, *given[3:6])
+    level = finish()(None, None, None, *given[3:6], torch.zeros(1))
     assert not torch.equal(level["depth_m"], depth["depth_m"])
 
 

@@ -1,6 +1,5 @@
 """The cache of decoded frames changes nothing but the time; broken data is one line everywhere."""
 
-import dataclasses
 import os
 import shutil
 from itertools import islice
@@ -8,8 +7,16 @@ from itertools import islice
 import cv2
 import numpy as np
 import pytest
-import torch
-from cityscapes_tree import HEIGHT, WIDTH, file, instance_ids, open_tree, put_png, write_tree
+from cityscapes_tree import (
+    HEIGHT,
+    WIDTH,
+    assert_same,
+    file,
+    instance_ids,
+    open_tree,
+    put_png,
+    write_tree,
+)
 from typer.testing import CliRunner
 
 from mtl_bench.cli.app import app
@@ -35,9 +42,11 @@ def reader(root, split="train", data=SMALL, **changes):
     return open_tree(root, split, data=data, **{"augment": AUGMENT, **changes})
 
 
-def fill(dataset, training=True):
-    sources = dataset.sources(training)
-    assert list(frame_cache.build(dataset.on_disk, sources)) == list(range(1, len(sources) + 1))
+def fill(dataset):
+    sources = dataset.dataset.sources()
+    assert list(frame_cache.build(dataset.dataset.on_disk, sources)) == list(
+        range(1, len(sources) + 1)
+    )
     return sources
 
 
@@ -45,12 +54,9 @@ def take(dataset, workers=0, count=2):
     return list(islice(train_batches(dataset, 3, seed=5, workers=workers), count))
 
 
-def assert_same(ones, others):
-    for one, two in zip(ones, others, strict=True):
-        for field in dataclasses.fields(one):
-            a, b = getattr(one, field.name), getattr(two, field.name)
-            same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-            assert same, field.name
+def assert_all_same(ones, others):
+    for one, other in zip(ones, others, strict=True):
+        assert_same(one, other)
 
 
 def spoil(path):
@@ -73,7 +79,7 @@ def test_samples_are_the_same_and_come_from_the_cache(tree, size, workers, in_me
     assert len(sources) == 3 * 3 + 3
     for path, _ in sources:
         spoil(path)
-    assert_same(take(reader(tree, data=data), workers), expected)
+    assert_all_same(take(reader(tree, data=data), workers), expected)
 
 
 def test_evaluation_is_the_same_and_its_truth_keeps_its_size(tree):
@@ -81,17 +87,17 @@ def test_evaluation_is_the_same_and_its_truth_keeps_its_size(tree):
         return list(eval_batches(reader(tree, "val", augment=None), 2))
 
     expected = batches()
-    images = fill(reader(tree, "val", augment=None), training=False)
+    images = fill(reader(tree, "val", augment=None))
     assert [content.what for _, content in images] == ["image"] * 3
     for path, _ in images:
         spoil(path)
-    assert_same(batches(), expected)
+    assert_all_same(batches(), expected)
     assert expected[0].fields["instance_ids"].shape[1:] == (2 * HEIGHT, 2 * WIDTH)
 
 
 def test_each_task_caches_its_own_files(tree):
     def kinds(**tasks):
-        sources = reader(tree, **tasks).sources(training=True)
+        sources = reader(tree, **tasks).dataset.sources()
         return [content.what for _, content in sources]
 
     assert kinds(video=False) == ["image"] * 3 + ["label map"] * 3
@@ -105,7 +111,9 @@ def test_another_size_is_another_cache(tree):
     larger = config.Data(height=2 * HEIGHT, width=2 * WIDTH, cache=False)
     batch = take(reader(tree, data=larger), count=1)[0]
     assert batch.image_B3HW.shape[-2:] == (20, 30)
-    assert all(reader(tree, data=larger).on_disk.lacks(p) for p in tree.rglob("*_leftImg8bit.png"))
+    assert all(
+        reader(tree, data=larger).dataset.on_disk.lacks(p) for p in tree.rglob("*_leftImg8bit.png")
+    )
 
 
 # --- what has changed or is damaged ---------------------------------------------------------------
@@ -121,11 +129,11 @@ def test_changed_data_is_noticed_and_cached_again(tree, workers):
         take(reader(tree), workers)
     assert "\n" not in str(error.value)
     dataset = reader(tree)
-    assert [p for p, _ in dataset.sources(training=True) if dataset.on_disk.lacks(p)] == [path]
+    assert [p for p, _ in dataset.dataset.sources() if dataset.dataset.on_disk.lacks(p)] == [path]
     fill(dataset)
     cached = take(dataset, workers)
     shutil.rmtree(tree / "frame_cache")
-    assert_same(take(reader(tree), workers), cached)
+    assert_all_same(take(reader(tree), workers), cached)
 
 
 @pytest.mark.parametrize("damage", [b"", b"x" * 5000, "cut", "longer"])
@@ -140,26 +148,26 @@ def test_a_damaged_cache_is_one_line(tree, damage):
     stored.write_bytes(other[damage] if isinstance(damage, str) else damage)
     with pytest.raises(ValueError, match=f"^{stored}: damaged; run 'mtl-bench data cache'"):
         take(dataset)
-    assert dataset.on_disk.lacks(source)
+    assert dataset.dataset.on_disk.lacks(source)
     fill(dataset)
     assert stored.read_bytes() == whole
 
 
 def test_a_stopped_build_leaves_whole_files_and_goes_on(tree):
     dataset = reader(tree)
-    sources = dataset.sources(training=True)
+    sources = dataset.dataset.sources()
     broken = sources[5][0]
     original = broken.read_bytes()
     broken.write_bytes(original[:100])
     with pytest.raises(ValueError, match=f"^{broken}: truncated PNG"):
-        list(frame_cache.build(dataset.on_disk, sources))
+        list(frame_cache.build(dataset.dataset.on_disk, sources))
     assert not list(tree.rglob("*.tmp"))
-    missing = [source for source in sources if dataset.on_disk.lacks(source[0])]
+    missing = [source for source in sources if dataset.dataset.on_disk.lacks(source[0])]
     assert sources[5] in missing
     assert not set(sources[:5]) & set(missing)
     broken.write_bytes(original)
-    list(frame_cache.build(dataset.on_disk, missing))
-    assert not any(dataset.on_disk.lacks(path) for path, _ in sources)
+    list(frame_cache.build(dataset.dataset.on_disk, missing))
+    assert not any(dataset.dataset.on_disk.lacks(path) for path, _ in sources)
 
 
 # --- the command ----------------------------------------------------------------------------------
@@ -198,13 +206,13 @@ def test_another_place_is_found_by_the_environment(tree, recipe, tmp_path, monke
     assert not (tree / "frame_cache").exists()
     monkeypatch.setenv("MTL_BENCH_FRAME_CACHE", str(place))
     dataset = reader(tree)
-    assert not any(dataset.on_disk.lacks(path) for path, _ in dataset.sources(training=True))
+    assert not any(dataset.dataset.on_disk.lacks(path) for path, _ in dataset.dataset.sources())
 
 
 def test_a_full_disk_and_wrong_tasks_are_one_line(tree, recipe, monkeypatch):
     result = command("--recipe", recipe, "--data", tree, "--tasks", "dept")
     assert (result.exit_code, result.stderr.count("\n")) == (2, 1)
-    assert "--tasks 'dept': choose from panoptic, depth" in result.stderr
+    assert "no task called 'dept' (did you mean 'depth'?)" in result.stderr
     free = shutil.disk_usage(tree)._replace(free=1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: free)
     result = command("--recipe", recipe, "--data", tree)

@@ -97,14 +97,6 @@ def test_warp_and_back_projection_equal_kornia(K_133: Tensor, pose_144: Tensor) 
     torch.testing.assert_close(warped, warp_frame_depth(image, depth, pose_144, K_133))
 
 
-def test_project_inverts_back_project(K_133: Tensor) -> None:
-    depth = 2 + pattern(1, 2, 0, 5, channels=1)
-    pixels, in_view = geometry.project(geometry.back_project(depth, K_133), K_133)
-    y, x = torch.meshgrid(torch.arange(12.0), torch.arange(16.0), indexing="ij")
-    torch.testing.assert_close(pixels[0], torch.stack((x, y), -1).to(F64))
-    assert in_view.all()
-
-
 def test_points_of_each_image_and_nan_where_there_is_no_depth(K_133: Tensor) -> None:
     depth = 2 + torch.cat([pattern(1, 2, 0, 5, channels=1)] * 2)
     K = K_133.repeat(2, 1, 1)
@@ -155,37 +147,3 @@ def test_extreme_depths_stay_finite(K_133: Tensor, pose_144: Tensor) -> None:
 def test_scaled_intrinsics(K_133: Tensor) -> None:
     expected = torch.tensor([[[5, 0, 3.5], [0, 3, 1.0], [0, 0, 1]]], dtype=F64)
     torch.testing.assert_close(geometry.scale_intrinsics(K_133, 0.5, 0.25), expected)
-
-
-def plane_depth(normal: Tensor, distance: float, K_133: Tensor) -> Tensor:
-    """Depth at which every pixel's ray meets the plane normal . X = distance: [1,1,12,16]."""
-    rays = geometry.back_project(torch.ones(1, 1, 12, 16, dtype=F64), K_133)
-    return distance / (rays * normal.view(1, 3, 1, 1)).sum(1, keepdim=True)
-
-
-@pytest.mark.parametrize("normal", [(0, 0, 1), (0, 1, 0.5), (0.3, -0.2, 0.9)])
-def test_normals_of_a_plane(normal: tuple[float, ...], K_133: Tensor) -> None:
-    expected = torch.nn.functional.normalize(torch.tensor(normal, dtype=F64), dim=0)
-    # below the camera's axis only, where the slanted planes are in front of it
-    K_133[0, 1, 2] = -1
-    K_133[0, :2, :2] *= 3
-    points = geometry.back_project(plane_depth(expected, 1.5, K_133), K_133)
-    normals = geometry.normals(points)
-    torch.testing.assert_close(normals, expected.view(1, 3, 1, 1).expand_as(normals))
-
-
-def test_ground_height_from_normals(K_133: Tensor) -> None:
-    K_133[0, 1, 2] = -1  # every ray goes down
-    down = torch.tensor([0, 1, 0], dtype=F64)
-    points = geometry.back_project(plane_depth(down, 1.22, K_133), K_133)
-    height = (geometry.normals(points) * points).sum(1)
-    torch.testing.assert_close(height, torch.full_like(height, 1.22))
-
-
-def test_all_four_neighbour_pairs_count_alike() -> None:
-    """Diagonal neighbours on one plane, the others on another: the normal lies between the two."""
-    y, x = torch.meshgrid(torch.arange(-1.0, 2), torch.arange(-1.0, 2), indexing="ij")
-    diagonal = (x * y).abs() > 0
-    z = 5 + torch.where(diagonal, 0.5 * x, -0.5 * x)
-    normal = geometry.normals(torch.stack((x, y, z))[None])[0, :, 1, 1]
-    torch.testing.assert_close(normal, torch.tensor([0.0, 0.0, 1.0]))

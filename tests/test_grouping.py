@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtl_bench.tasks.panoptic import grouping
+from mtl_bench.tasks.panoptic import nearest_center
 
 SIZE = (96, 200)
 
@@ -24,7 +24,7 @@ def reference(point_2N, image_N, centers, count_B):
 def check(point_2N, centers_BK2, count_B, image_N=None, size=SIZE):
     point_2N, centers_BK2 = (np.asarray(x, np.float32) for x in (point_2N, centers_BK2))
     image_N = np.zeros(point_2N.shape[1], np.int64) if image_N is None else image_N
-    got = grouping.nearest(
+    got = nearest_center.nearest(
         *(torch.from_numpy(np.ascontiguousarray(x)) for x in (point_2N, image_N, centers_BK2)),
         torch.tensor(count_B),
         size,
@@ -116,10 +116,10 @@ def test_lists_are_short():
     rng = np.random.default_rng(4)
     centers_1K2 = torch.from_numpy(centers_in(rng, 200, (1024, 2048))[None].astype(np.float32))
     is_center = torch.ones(1, 200, 1, dtype=torch.bool)
-    levels = grouping._levels(centers_1K2, is_center, (1024, 2048))
-    _, length_M, _ = grouping._candidates(centers_1K2, torch.tensor([200]), levels)
+    levels = nearest_center._levels(centers_1K2, is_center, (1024, 2048))
+    _, length_M, _ = nearest_center._candidates(centers_1K2, torch.tensor([200]), levels)
     in_image = torch.from_numpy(rng.uniform(0, 1, (2, 10000)).astype(np.float32))
     in_image *= torch.tensor([[1024.0], [2048.0]])
-    length_N = length_M[grouping._cells(in_image, levels)]
+    length_N = length_M[nearest_center._cells(in_image, levels)]
     assert length_N.float().mean() < 2.5
     assert length_N.max() < 12

@@ -37,14 +37,17 @@ from mtl_bench.bench.run import run_cell
 from mtl_bench.cli.app import app
 from mtl_bench.core import config
 from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.core.dataset import dataset_of
+from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data import kitti_files, kitti_splits, velodyne
 from mtl_bench.data.check_kitti import check_kitti
 from mtl_bench.data.kitti_files import Tree, read_camera, scanner_to_pixels
 from mtl_bench.data.kitti_splits import Frame
-from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, labels_of
-from mtl_bench.data.loader import eval_batches, open_dataset
-from mtl_bench.evaluate import pseudo_labels
+from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
+from mtl_bench.data.loader import eval_batches
+from mtl_bench.data.samples import open_samples
 from mtl_bench.evaluate.trivial import baselines
+from mtl_bench.tasks.panoptic import pseudo_labels
 
 REAL = SHARED / "data" / "kitti_raw"
 LISTS = SHARED / "data" / "splits"
@@ -104,7 +107,7 @@ def test_projected_scan_of_a_real_frame(number, pixels, counted, median, total):
 def test_the_real_sample_as_a_data_set():
     dataset = open_tree(REAL, "test", data=config.Data(height=375, width=1242))
     assert dataset.names == names(TEST, 3, 6)
-    assert dataset.described == {
+    assert dataset.dataset.described == {
         "frames": 2,
         "frames_published": 697,
         "left_out": {"absent": 693, "without depth maps": 2},
@@ -188,8 +191,8 @@ def test_a_tree_of_other_days_brings_its_own_lists(tree):
 def test_training_frames_have_both_neighbours(tree):
     dataset = open_tree(tree)
     assert dataset.names == names(TRAIN, 3, 4, 5)
-    assert dataset.left_out == {"absent": 39810 - 5, "without neighbours": 2}
-    assert dataset.published_frames == 39810
+    assert dataset.dataset.left_out == {"absent": 39810 - 5, "without neighbours": 2}
+    assert dataset.dataset.published_frames == 39810
     sample = dataset.sample(1, generator())
     for place, number in enumerate((3, 5)):
         image = cv2.imread(str(file(tree, TRAIN, "image_02", number)))[..., ::-1]
@@ -199,7 +202,7 @@ def test_training_frames_have_both_neighbours(tree):
     assert (sample.fields["semantic"][:4] == sky).all()
     assert not sample.fields["reprojection_mask"][:4].any()
     assert sample.fields["reprojection_mask"][4:].all()
-    assert (dataset.reprojection_mask, dataset.needs_automask) == ("labels", False)
+    assert (dataset.dataset.static_from, dataset.dataset.knows_static) == ("labels", True)
     K = torch.tensor([[FOCAL, 0, 23.5], [0, FOCAL, 7.5], [0, 0, 1]])
     torch.testing.assert_close(sample.camera.K_B33, K)
 
@@ -214,7 +217,7 @@ def test_all_frames_train_but_those_that_measure(tree):
     write_drive(tree, VAL, range(3, 8))  # 4 and 6 validate
     expected[3:3] = names(VAL, 5)
     assert open_tree(tree, data=data, panoptic=False).names == expected
-    assert dataset.described["frames_published"] is None
+    assert dataset.dataset.described["frames_published"] is None
     assert dataset.sample(len(dataset) - 1, generator()).image_B3HW.shape == (3, HEIGHT, WIDTH)
     with pytest.raises(ValueError, match="must be published or all, not 'most'"):
         open_tree(tree, data=replace(data, train_frames="most"))
@@ -223,7 +226,7 @@ def test_all_frames_train_but_those_that_measure(tree):
 def test_truth_of_test_frames(tree):
     dataset = open_tree(tree, "test")
     assert dataset.names == [*names(TEST, 3, 6, 9), *names(OTHER_DAY, 3, 6)]
-    assert dataset.truths == {"improved": 2, "velodyne": 3}
+    assert dataset.dataset.truth_counts == {"improved": 2, "velodyne": 3}
     scanned, stored = (dataset.sample(index, None).fields["depth_m"] for index in (0, 1))
     assert torch.equal(stored[1:], torch.full((HEIGHT - 1, WIDTH), 5.0))
     assert (stored[0] == 0).all()
@@ -231,11 +234,15 @@ def test_truth_of_test_frames(tree):
     assert 100 < torch.count_nonzero(scanned) < 37 * 13
 
     raw = open_tree(tree, "test", truth="velodyne")
-    assert (len(raw), raw.published_frames, dict(raw.truths)) == (5, 697, {"velodyne": 5})
+    assert (len(raw), raw.dataset.published_frames, dict(raw.dataset.truth_counts)) == (
+        5,
+        697,
+        {"velodyne": 5},
+    )
     best = open_tree(tree, "test", truth="improved")
     assert best.names == names(TEST, 6, 9)
-    assert (best.published_frames, best.left_out["without depth maps"]) == (652, 3)
-    with pytest.raises(ValueError, match="no depth truth 'stereo': it has default, improved"):
+    assert (best.dataset.published_frames, best.dataset.left_out["without depth maps"]) == (652, 3)
+    with pytest.raises(ValueError, match="no depth truth 'stereo': it has improved"):
         open_tree(tree, "test", truth="stereo")
 
 
@@ -284,17 +291,17 @@ def test_predicted_labels_are_no_truth(tree):
     dataset = open_tree(tree, "test")
     assert dataset.sample(0, None).fields["instance_ids"].unique().tolist() == [7, 23, 26001]
     (tree / kitti_files.RECORD).write_text("{}")
-    assert open_tree(tree, "test").sample(0, "instance_ids" not in None).fields
+    assert "instance_ids" not in open_tree(tree, "test").sample(0, None).fields
     assert open_tree(tree).sample(0, generator()).fields["semantic"] is not None
     (tree / kitti_files.RECORD).unlink()
     file(tree, TEST, "label_02", 3).unlink()  # metrics over some of the frames would be others
-    assert open_tree(tree, "test").sample(1, "instance_ids" not in None).fields
+    assert "instance_ids" not in open_tree(tree, "test").sample(1, None).fields
 
 
 def test_depth_trains_without_labels(tree):
     shutil.rmtree(tree / "2011_09_26" / TRAIN / "label_02")
     dataset = open_tree(tree, panoptic=False)
-    assert (dataset.reprojection_mask, dataset.needs_automask) == ("none", True)
+    assert (dataset.dataset.static_from, dataset.dataset.knows_static) == ("none", False)
     assert dataset.sample(0, generator()).fields["reprojection_mask"].all()
 
 
@@ -312,26 +319,34 @@ def test_cached_frames_change_nothing(tree, monkeypatch):
     data = config.Data(dataset="kitti", height=8, width=24, cache=False)
     fresh = open_tree(tree, data=data)
     samples = [fresh.sample(index, generator(index)) for index in range(3)]
-    sources = fresh.sources(training=True)
+    sources = fresh.dataset.sources()
     assert len(sources) == 5 + 3  # with neighbours; labels
     for path, content in sources:
-        fresh.on_disk.add(path, content)
+        fresh.dataset.on_disk.add(path, content)
     monkeypatch.setattr("mtl_bench.data.png.read", None)
     for index, sample in enumerate(samples):
         again = open_tree(tree, data=data).sample(index, generator(index))
-        for name, value in vars(sample).items():
-            assert name == "names" or value is None or torch.equal(getattr(again, name), value)
+        for name, value in sample.tensors().items():
+            assert torch.equal(again.tensors()[name], value)
+
+
+def opened(cell, split, root, **truth):
+    return open_samples(cell.recipe, tasks_of_cell(cell), split, root, training=False, **truth)
 
 
 def test_data_sets_by_name(tree, smoke_root):
-    assert labels_of("kitti") == labels_of("synthetic-kitti") == CITYSCAPES19
-    assert labels_of("cityscapes") == labels_of("synthetic") == CITYSCAPES20
+    labels = {
+        name: dataset_of(config.Recipe(data=config.Data(dataset=name))).labels
+        for name in ("kitti", "synthetic-kitti", "cityscapes", "synthetic")
+    }
+    assert labels["kitti"] == labels["synthetic-kitti"] == CITYSCAPES19
+    assert labels["cityscapes"] == labels["synthetic"] == CITYSCAPES20
     cell = cell_of(height=HEIGHT, width=WIDTH)
-    assert len(open_dataset(cell, "test", tree, training=False)) == 5
-    assert len(open_dataset(cell, "test", tree, training=False, truth="improved")) == 2
+    assert len(opened(cell, "test", tree)) == 5
+    assert len(opened(cell, "test", tree, truth="improved")) == 2
     smoke = Cell(load_recipe("smoke"), "tiny", "fixed_uncertainty")
     with pytest.raises(ValueError, match="no depth truth 'velodyne': it has disparity"):
-        open_dataset(smoke, "val", smoke_root, training=False, truth="velodyne")
+        opened(smoke, "val", smoke_root, truth="velodyne")
 
 
 def test_trivial_predictors_of_days_of_two_sizes(tree, tmp_path):
@@ -536,7 +551,7 @@ def test_check_of_a_tree(tree):
 # --- pseudo labels --------------------------------------------------------------------------------
 
 
-def cell_of(recipe="kitti-smoke", tasks=config.TASKS, dataset="kitti", **data):
+def cell_of(recipe="kitti-smoke", tasks=(), dataset="kitti", **data):
     base = load_recipe(recipe)
     changed = replace(base, data=replace(base.data, dataset=dataset, **data))
     return Cell(changed, "tiny", "fixed_uncertainty", tasks=tasks)
@@ -596,13 +611,19 @@ def test_the_ego_vehicle_is_left_unlabeled(tree, teacher, monkeypatch):
 def test_what_cannot_be_labelled(tree, teacher):
     words = ("pseudo-label", "--checkpoint", teacher, "--data", tree)
     assert "not of this command's making" in call(*words, code=2).replace("\n", " ")
-    video = replace(cell_of(height=HEIGHT, width=WIDTH), video=True)
-    with pytest.raises(ValueError, match="KITTI's labels are pseudo labels already"):
-        pseudo_labels.ensure(None, video, tree, None, torch.device("cpu"))
     for path in tree.glob("*/*/label_02"):
         shutil.rmtree(path)
     shutil.rmtree(tree / "2011_09_26" / TRAIN)
     assert "'--split all' labels every frame" in call(*words, code=2).replace("\n", " ")
+
+
+def test_the_video_stage_needs_a_data_set_that_takes_its_labels(tree):
+    video = replace(cell_of(height=HEIGHT, width=WIDTH), video=True)
+    refused(
+        "video .* kitti takes no further labels; set video=false",
+        lambda: execute(video, tree / "runs", tree),
+    )
+    assert not list((tree / "runs").rglob("*.png"))
 
 
 # --- whole cells ----------------------------------------------------------------------------------

@@ -105,9 +105,7 @@ def test_smoke_stands_in_place_of_axes_under_another_name(write):
     shipped = load_grid("latency", smoke=True)
     assert {t.engine for t in shipped.jobs} == {"plain", "eager", "onnxruntime", "openvino"}
     assert len(shipped.jobs) == 4
-    assert not {t.id for t in shipped.jobs} & {
-        t.id for t in load_grid("latency").jobs
-    }
+    assert not {t.id for t in shipped.jobs} & {t.id for t in load_grid("latency").jobs}
 
 
 def test_settings_replace_an_axis_or_a_value(write):

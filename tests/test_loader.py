@@ -1,4 +1,3 @@
-import dataclasses
 import multiprocessing
 import os
 import signal
@@ -9,12 +8,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from cityscapes_tree import HEIGHT, WIDTH, file, open_tree, write_tree
+from cityscapes_tree import HEIGHT, WIDTH, assert_same, file, open_tree, write_tree
 
 from mtl_bench.core import config
+from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data import loader
-from mtl_bench.data.cityscapes import Cityscapes
-from mtl_bench.data.loader import eval_batches, open_dataset, train_batches
+from mtl_bench.data.loader import eval_batches, train_batches
+from mtl_bench.data.samples import Samples, open_samples
 
 
 @pytest.fixture(scope="module")
@@ -24,16 +24,6 @@ def tree(tmp_path_factory):
 
 def take(dataset, count, **settings):
     return list(islice(train_batches(dataset, **{"batch_size": 3, "seed": 5, **settings}), count))
-
-
-def assert_same(one, two):
-    for field in dataclasses.fields(one):
-        a, b = getattr(one, field.name), getattr(two, field.name)
-        if isinstance(a, torch.Tensor):
-            assert a.dtype == b.dtype
-            assert torch.equal(a, b), field.name
-        else:
-            assert a == b
 
 
 def test_batches_are_stacked(tree):
@@ -58,11 +48,9 @@ def test_a_batch_splits_into_consecutive_parts(tree):
         parts = batch.split(size)
         assert [len(part.names) for part in parts] == [size] * (6 // size)
         assert [name for part in parts for name in part.names] == batch.names
-        for field in dataclasses.fields(batch):
-            values = [getattr(part, field.name) for part in parts]
-            if isinstance(values[0], torch.Tensor):
-                assert torch.equal(torch.cat(values), getattr(batch, field.name)), field.name
-    assert batch.split(2)["depth_m" not in 1].fields
+        for name, whole in batch.tensors().items():
+            assert torch.equal(torch.cat([part.tensors()[name] for part in parts]), whole), name
+    assert "depth_m" not in batch.split(2)[1].fields
     for size in (4, 0, 7, -2):
         with pytest.raises(ValueError, match=rf"micro_batch = {size} does not divide a batch of 6"):
             batch.split(size)
@@ -156,16 +144,14 @@ def test_a_broken_file_is_one_line_from_any_process(tmp_path, workers):
 
 def test_workers_hand_over_shared_memory_sample_by_sample(tree):
     (batch,) = take(open_tree(tree), 1, workers=1)
-    for field in dataclasses.fields(batch):
-        value = getattr(batch, field.name)
-        if isinstance(value, torch.Tensor):
-            assert value.is_shared()
-            assert value.is_contiguous()
+    for value in batch.tensors().values():
+        assert value.is_shared()
+        assert value.is_contiguous()
 
 
 def test_a_worker_that_the_system_ends_is_one_line(tree, monkeypatch):
     dataset = open_tree(tree)
-    monkeypatch.setattr(Cityscapes, "sample", lambda *given: os.kill(os.getpid(), signal.SIGKILL))
+    monkeypatch.setattr(Samples, "sample", lambda *given: os.kill(os.getpid(), signal.SIGKILL))
     message = r"process was ended .*lower recipe\.data\.workers"
     with pytest.raises(ValueError, match=message) as error:
         take(dataset, 1, workers=1)
@@ -177,7 +163,7 @@ def test_a_bug_in_a_worker_keeps_its_traceback(tree, monkeypatch):
         raise RuntimeError("a bug")
 
     dataset = open_tree(tree)
-    monkeypatch.setattr(Cityscapes, "sample", fail)
+    monkeypatch.setattr(Samples, "sample", fail)
     with pytest.raises(RuntimeError, match="in fail"):
         take(dataset, 1, workers=1)
 
@@ -199,21 +185,25 @@ def cell(**changes):
     return config.Cell(recipe, backbone="any", method="any", **changes)
 
 
+def opened(cell, tree):
+    return open_samples(cell.recipe, tasks_of_cell(cell), "train", tree, training=True)
+
+
 @pytest.mark.parametrize("dataset", ["cityscapes", "synthetic"])
 def test_a_cell_opens_what_its_tasks_need(tree, dataset):
-    both = open_dataset(cell(dataset=dataset), "train", tree, training=True)
+    both = opened(cell(dataset=dataset), tree)
     (batch,) = take(both, 1)
     assert "semantic" in batch.fields
     assert "neighbours" in batch.fields
-    (batch,) = take(open_dataset(cell(tasks=("panoptic",)), "train", tree, training=True), 1)
+    (batch,) = take(opened(cell(tasks=("panoptic",)), tree), 1)
     assert "neighbours" not in batch.fields
-    (batch,) = take(open_dataset(cell(tasks=("depth",)), "train", tree, training=True), 1)
+    (batch,) = take(opened(cell(tasks=("depth",)), tree), 1)
     assert "semantic" not in batch.fields
 
 
 def test_errors(tree):
     with pytest.raises(ValueError, match="did you mean 'cityscapes'"):
-        open_dataset(cell(dataset="cityscape"), "train", tree, training=True)
+        opened(cell(dataset="cityscape"), tree)
     for batch_size in (0, 8):
         with pytest.raises(ValueError, match="from 7 frames; set recipe"):
             train_batches(open_tree(tree), batch_size, seed=0)

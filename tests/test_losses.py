@@ -5,17 +5,15 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from mtl_bench.core import config, geometry
-from mtl_bench.core.batch import Batch
-from mtl_bench.model import Outputs
-from mtl_bench.tasks.depth.photometric import photometric_loss
-from mtl_bench.tasks.depth.smoothness import smoothness_loss
-from mtl_bench.tasks.depth.ssim import PhotometricError
-from mtl_bench.tasks.losses import TERMS, loss_terms, terms_of
-from mtl_bench.tasks.panoptic.instance_loss import center_loss, offset_loss
-from mtl_bench.tasks.panoptic.semantic_loss import semantic_loss
+from mtl_bench.core.batch import Batch, Camera
+from mtl_bench.core.task import Maps, tasks_of, terms_of
+from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.model import Model, Outputs
+from mtl_bench.tasks.depth.losses import PhotometricError, photometric_loss, smoothness_loss
+from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_loss
 
 F64 = torch.float64
 TASKS = ("panoptic", "depth")
@@ -356,8 +354,13 @@ def test_center_and_offset_values() -> None:
 # --- all of them ----------------------------------------------------------------------------------
 
 
+def named(*names: str, loss: config.Loss | None = None):
+    return tasks_of(config.Recipe(loss=loss or config.Loss()), names, CITYSCAPES20)
+
+
 def test_terms_are_the_papers() -> None:
-    weights = {term.name: term.fixed_weight for term in TERMS}
+    terms = terms_of(named(*TASKS))
+    weights = {term.name: term.fixed_weight for term in terms}
     assert weights == {
         "semantic": 1,
         "center": 200,
@@ -365,137 +368,145 @@ def test_terms_are_the_papers() -> None:
         "photometric": 1,
         "smoothness": 0.001,
     }
-    assert [t.name for t in TERMS if t.kind == "classification"] == ["semantic"]
-    assert terms_of(TASKS) == terms_of(reversed(TASKS)) == TERMS
-    assert [t.name for t in terms_of(["depth"])] == ["photometric", "smoothness"]
+    assert [t.name for t in terms if t.kind == "classification"] == ["semantic"]
+    assert terms_of(named(*reversed(TASKS))) == terms
+    assert [t.name for t in terms_of(named("depth"))] == ["photometric", "smoothness"]
     with pytest.raises(ValueError, match="'dept'"):
-        terms_of(["dept"])
+        named("dept")
 
 
-def make_batch(size: int = 2, height: int = 16, width: int = 24) -> tuple[Batch, Outputs, Tensor]:
+def make_batch(size: int = 2, height: int = 16, width: int = 24) -> tuple[Batch, dict[str, Maps]]:
+    """A batch with both tasks' targets, and maps of the network; leaves require gradients."""
     torch.manual_seed(3)
     image, offset = torch.rand(size, 3, height, width), torch.randn(size, 2, height, width)
     context = torch.rand(size, 2, 3, height, width)
     ones = torch.ones(size, 1, height, width)
+    K_B33 = torch.tensor([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]).repeat(size, 1, 1)
     batch = Batch(
         names=["x"] * size,
         image_B3HW=image,
-        K_B33=torch.tensor([[20.0, 0, 11.5], [0, 20, 7.5], [0, 0, 1]]).repeat(size, 1, 1),
-        camera_height_m_B=torch.full((size,), 1.2),
-        camera_pitch_rad_B=torch.zeros(size),
-        context_BN3HW=context,
-        clean_B3HW=image,
-        clean_context_BN3HW=context,
-        reprojection_mask_BHW=ones[:, 0] > 0,
-        semantic_BHW=torch.randint(0, 20, (size, height, width)),
-        semantic_weight_BHW=ones[:, 0],
-        center_B1HW=torch.rand_like(ones),
-        center_weight_B1HW=ones,
-        offset_B2HW=offset,
-        offset_weight_B1HW=ones,
+        camera=Camera(K_B33, torch.full((size,), 1.2), torch.zeros(size)),
+        fields={
+            "neighbours": context,
+            "clean": image,
+            "clean_neighbours": context,
+            "reprojection_mask": ones[:, 0] > 0,
+            "semantic": torch.randint(0, 20, (size, height, width)),
+            "semantic_weight": ones[:, 0],
+            "center": torch.rand_like(ones),
+            "center_weight": ones,
+            "offset": offset,
+            "offset_weight": ones,
+        },
     )
-    outputs = Outputs(
-        semantic_BCHW=torch.randn(size, 20, height, width, requires_grad=True),
-        center_B1HW=torch.rand_like(ones).requires_grad_(),
-        offset_B2HW=torch.randn_like(offset).requires_grad_(),
-        inverse_depth=[(0.2 + torch.rand_like(ones)).requires_grad_() for _ in range(3)],
-    )
+    panoptic = {
+        "semantic": torch.randn(size, 20, height, width, requires_grad=True),
+        "center": torch.rand_like(ones).requires_grad_(),
+        "offset": torch.randn_like(offset).requires_grad_(),
+    }
+    depth = {
+        name: (0.2 + torch.rand_like(ones)).requires_grad_()
+        for name in ("inverse", "inverse.1", "inverse.2")
+    }
     motion = torch.tensor([[0, 0, 0.05, 0, 0, 0], [0, 0, -0.05, 0, 0, 0]])
     transforms = geometry.pose_from_vector(motion).repeat(size, 1, 1, 1).requires_grad_()
-    return batch, outputs, transforms
+    return batch, {"panoptic": panoptic, "depth": depth | {"transforms": transforms}}
 
 
-def leaves(outputs: Outputs, transforms: Tensor) -> dict[str, list[Tensor]]:
+def loss_terms(
+    batch: Batch,
+    maps: dict[str, Maps],
+    tasks: tuple[str, ...] = TASKS,
+    loss: config.Loss | None = None,
+) -> dict[str, Tensor]:
+    return Model(nn.Identity(), named(*tasks, loss=loss)).losses(Outputs(maps), batch)
+
+
+def leaves(maps: dict[str, Maps]) -> dict[str, list[Tensor]]:
     """What each term must reach, and nothing else."""
-    assert outputs.semantic_BCHW is not None
-    assert "center" in outputs.fields
-    assert "offset" in outputs.fields
+    inverse = [maps["depth"][name] for name in ("inverse", "inverse.1", "inverse.2")]
     return {
-        "semantic": [outputs.semantic_BCHW],
-        "center": [outputs.fields["center"]],
-        "offset": [outputs.fields["offset"]],
-        "photometric": [*outputs.inverse_depth, transforms],
-        "smoothness": [*outputs.inverse_depth],
+        **{name: [map_] for name, map_ in maps["panoptic"].items()},
+        "photometric": [*inverse, maps["depth"]["transforms"]],
+        "smoothness": inverse,
     }
 
 
 @pytest.mark.parametrize("tasks", [TASKS, ("panoptic",), ("depth",)])
 def test_loss_terms_of_each_task_set(tasks: tuple[str, ...]) -> None:
-    batch, outputs, transforms = make_batch()
-    losses = loss_terms(batch, outputs, transforms, config.Loss(), tasks)
-    assert list(losses) == [term.name for term in terms_of(tasks)]
+    batch, maps = make_batch()
+    losses = loss_terms(batch, maps, tasks)
+    assert list(losses) == [term.name for term in terms_of(named(*tasks))]
     for name, loss in losses.items():
         assert loss.shape == ()
         assert loss.dtype == torch.float32
         assert loss.item() > 0
-        wanted = leaves(outputs, transforms)[name]
+        wanted = leaves(maps)[name]
         for grad in torch.autograd.grad(loss, wanted, retain_graph=True):
             assert grad.isfinite().all()
             assert grad.abs().sum() > 0
 
 
 def test_terms_without_pixels_are_zero_in_the_graph() -> None:
-    batch, outputs, transforms = make_batch()
-    for name in ("semantic_weight_BHW", "center_weight_B1HW", "offset_weight_B1HW"):
-        setattr(batch, name, torch.zeros_like(getattr(batch, name)))
-    batch.fields["semantic"] = torch.full_like(batch.fields["semantic"], 255)  # type: ignore[arg-type]
-    batch.fields["reprojection_mask"] = torch.zeros_like(batch.fields["reprojection_mask"])  # type: ignore[arg-type]
-    losses = loss_terms(batch, outputs, transforms, config.Loss(), TASKS)
+    batch, maps = make_batch()
+    for name in ("semantic_weight", "center_weight", "offset_weight", "reprojection_mask"):
+        batch.fields[name] = torch.zeros_like(batch.fields[name])
+    batch.fields["semantic"] = torch.full_like(batch.fields["semantic"], 255)
+    losses = loss_terms(batch, maps)
+    assert len(losses) == 5
     for name, loss in losses.items():
         assert loss.item() == 0
-        for grad in torch.autograd.grad(loss, leaves(outputs, transforms)[name], retain_graph=True):
+        for grad in torch.autograd.grad(loss, leaves(maps)[name], retain_graph=True):
             assert (grad == 0).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_outputs_under_autocast(dtype: torch.dtype) -> None:
     """What mixed precision hands over: the losses equal those of the same values in float32."""
-    batch, outputs, transforms = make_batch()
+    batch, maps = make_batch()
 
-    def cast(to: torch.dtype) -> Outputs:
-        half = [
-            t.detach().to(dtype).to(to) for ts in leaves(outputs, transforms).values() for t in ts
-        ]
-        return Outputs(half[0], half[1], half[2], half[3:6])
+    def cast(to: torch.dtype) -> dict[str, Maps]:
+        return {
+            task: {
+                name: map_ if name == "transforms" else map_.detach().to(dtype).to(to)
+                for name, map_ in own.items()
+            }
+            for task, own in maps.items()
+        }
 
-    expected = loss_terms(batch, cast(torch.float32), transforms, config.Loss(), TASKS)
+    expected = loss_terms(batch, cast(torch.float32))
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        losses = loss_terms(batch, cast(dtype), transforms, config.Loss(), TASKS)
+        losses = loss_terms(batch, cast(dtype))
     for name, loss in losses.items():
         assert loss.dtype == torch.float32
         assert loss.item() == expected[name].item()
 
 
 def test_scales_choose_depth_outputs() -> None:
-    batch, outputs, transforms = make_batch()
-    each = [
-        loss_terms(batch, outputs, transforms, config.Loss(scales=(i,)), ("depth",))
-        for i in range(3)
-    ]
-    every = loss_terms(batch, outputs, transforms, config.Loss(), ("depth",))
+    batch, maps = make_batch()
+    each = [loss_terms(batch, maps, ("depth",), config.Loss(scales=(i,))) for i in range(3)]
+    every = loss_terms(batch, maps, ("depth",))
     for name in ("photometric", "smoothness"):
         mean = sum(losses[name].item() for losses in each) / 3
         assert every[name].item() == pytest.approx(mean, rel=1e-5)
     for scales in ((3,), (-1,), ()):
         with pytest.raises(ValueError, match=r"recipe\.loss\.scales"):
-            loss_terms(batch, outputs, transforms, config.Loss(scales=scales), ("depth",))
+            loss_terms(batch, maps, ("depth",), config.Loss(scales=scales))
 
 
 def test_automask_switch_reaches_the_loss() -> None:
-    batch, outputs, transforms = make_batch()
+    batch, maps = make_batch()
     masked, plain = (
-        loss_terms(batch, outputs, transforms, config.Loss(automask=on), ("depth",))["photometric"]
+        loss_terms(batch, maps, ("depth",), config.Loss(automask=on))["photometric"]
         for on in (True, False)
     )
     assert masked.item() < plain.item()
 
 
 def test_a_task_without_labels_or_neighbours_has_no_terms() -> None:
-    batch, outputs, transforms = make_batch()
-    batch.fields["semantic"] = None
-    losses = loss_terms(batch, outputs, transforms, config.Loss(), TASKS)
-    assert list(losses) == ["photometric", "smoothness"]
-    batch, outputs, _ = make_batch()
-    batch.fields["clean_neighbours"] = None
-    losses = loss_terms(batch, outputs, None, config.Loss(), TASKS)
-    assert list(losses) == ["semantic", "center", "offset"]
+    batch, maps = make_batch()
+    del batch.fields["semantic"]
+    assert list(loss_terms(batch, maps)) == ["photometric", "smoothness"]
+    batch, maps = make_batch()
+    del batch.fields["clean_neighbours"], maps["depth"]["transforms"]
+    assert list(loss_terms(batch, maps)) == ["semantic", "center", "offset"]

@@ -6,16 +6,23 @@ import pytest
 import torch
 from torch import nn
 
+from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Network, Recipe, load_recipe, recipe_names
 from mtl_bench.core.device import initial_weights
+from mtl_bench.core.labels import LabelSet
+from mtl_bench.core.task import tasks_of
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
-from mtl_bench.model import build_model
+from mtl_bench.model import Model, build_model
 from mtl_bench.model.layers import Decoder, GlobalContext, Head
 from mtl_bench.tasks.depth.pose import PoseNetwork
 
 PAPER = Cell(Recipe(), backbone="resnet18", method="fixed")
 SMALL = Network(strides=(2, 4, 8), channels=8, fused=8, head=8, pose="light", pose_channels=8)
 TINY = Cell(replace(Recipe(), network=SMALL), backbone="tiny", method="fixed")
+
+
+def built(cell: Cell, labels: LabelSet = CITYSCAPES20) -> Model:
+    return build_model(cell, tasks_of(cell.recipe, cell.tasks, labels))
 
 
 def count(module: nn.Module) -> int:
@@ -51,32 +58,36 @@ def test_parts_have_the_published_sizes():
     ],
 )
 def test_inference_parameters_are_the_papers(labels, tasks, expected):
-    model = build_model(replace(PAPER, tasks=tasks), labels)
+    model = built(replace(PAPER, tasks=tasks), labels)
     assert inference_count(model) == expected
     assert count(model.net.backbone) == 11_176_512
 
 
 def test_training_parameters_are_the_papers():
-    model = build_model(PAPER, CITYSCAPES20)
+    model = built(PAPER)
     assert count(model) + 5 == 30_944_273  # five log-variances are the method's
 
 
 def test_outputs_have_the_inputs_size():
-    model = build_model(TINY, CITYSCAPES20).train()
-    outputs = model.net(torch.rand(2, 3, 32, 64))
-    assert outputs.semantic_BCHW.shape == (2, 20, 32, 64)
-    assert outputs.fields["center"].shape == (2, 1, 32, 64)
-    assert outputs.fields["offset"].shape == (2, 2, 32, 64)
-    assert [depth.shape for depth in outputs.inverse_depth] == [(2, 1, 32, 64)] * 3
-    assert outputs.fields["center"].min() >= 0
-    assert outputs.fields["center"].max() <= 1
-    assert outputs.inverse_depth[0].max() <= 1 / SMALL.min_depth
+    model = built(TINY).train()
+    maps = model.net(torch.rand(2, 3, 32, 64)).maps
+    assert list(maps) == ["panoptic", "depth"]
+    panoptic, depth = maps["panoptic"], maps["depth"]
+    assert panoptic["semantic"].shape == (2, 20, 32, 64)
+    assert panoptic["center"].shape == (2, 1, 32, 64)
+    assert panoptic["offset"].shape == (2, 2, 32, 64)
+    assert {name: inverse.shape for name, inverse in depth.items()} == dict.fromkeys(
+        ("inverse", "inverse.1", "inverse.2"), (2, 1, 32, 64)
+    )
+    assert panoptic["center"].min() >= 0
+    assert panoptic["center"].max() <= 1
+    assert depth["inverse"].max() <= 1 / SMALL.min_depth
     model.eval()
-    assert len(model.net(torch.rand(1, 3, 32, 64)).inverse_depth) == 1
+    assert list(model.net(torch.rand(1, 3, 32, 64)).maps["depth"]) == ["inverse"]
 
 
 def test_pyramid_of_the_paper_at_128x256():
-    model = build_model(PAPER, CITYSCAPES20).eval()
+    model = built(PAPER).eval()
     features = model.net.backbone(torch.rand(1, 3, 128, 256))
     assert {s: tuple(f.shape[1:]) for s, f in features.items()} == {
         8: (128, 16, 32),
@@ -87,7 +98,7 @@ def test_pyramid_of_the_paper_at_128x256():
 
 @pytest.mark.parametrize("tasks", [("panoptic",), ("depth",), ("panoptic", "depth")])
 def test_every_parameter_is_either_shared_or_a_tasks(tasks):
-    model = build_model(replace(TINY, tasks=tasks), CITYSCAPES20)
+    model = built(replace(TINY, tasks=tasks))
     shared = {id(p) for p in model.shared_parameters()}
     own = {id(p) for p in model.task_parameters()}
     assert not shared & own
@@ -95,18 +106,18 @@ def test_every_parameter_is_either_shared_or_a_tasks(tasks):
 
 
 def test_every_parameter_gets_a_gradient():
-    model = build_model(TINY, CITYSCAPES20).train()
-    image, context = torch.rand(2, 3, 32, 64), torch.rand(2, 2, 3, 32, 64)
-    outputs = model.net(image)
-    transforms = model.pose(image, context)
-    assert transforms.shape == (2, 2, 4, 4)
-    parts = [outputs.semantic_BCHW, outputs.fields["center"], outputs.fields["offset"], transforms]
-    sum(part.square().sum() for part in [*parts, *outputs.inverse_depth]).backward()
+    model = built(TINY).train()
+    neighbours = {"neighbours": torch.rand(2, 2, 3, 32, 64)}
+    outputs = model(Batch(["a", "b"], torch.rand(2, 3, 32, 64), fields=neighbours))
+    assert outputs.maps["depth"]["transforms"].shape == (2, 2, 4, 4)
+    parts = [map_ for own in outputs.maps.values() for map_ in own.values()]
+    assert len(parts) == 3 + 3 + 1
+    sum(part.square().sum() for part in parts).backward()
     assert [name for name, p in model.named_parameters() if p.grad is None] == []
 
 
 def test_poses_start_near_the_identity():
-    model = build_model(TINY, CITYSCAPES20).eval()
+    model = built(TINY).eval()
     transforms = model.pose(torch.rand(2, 3, 32, 64), torch.rand(2, 2, 3, 32, 64))
     assert (transforms - torch.eye(4)).abs().max() < 0.05
 
@@ -114,7 +125,7 @@ def test_poses_start_near_the_identity():
 def test_same_seed_same_weights_and_other_seed_others():
     def weights(seed):
         with initial_weights(seed):
-            return torch.cat([p.flatten() for p in build_model(TINY, CITYSCAPES20).parameters()])
+            return torch.cat([p.flatten() for p in built(TINY).parameters()])
 
     assert torch.equal(weights(1), weights(1))
     assert not torch.equal(weights(1), weights(2))
@@ -123,12 +134,12 @@ def test_same_seed_same_weights_and_other_seed_others():
 def test_input_that_the_pyramid_does_not_divide():
     data = replace(Recipe().data, height=60, width=128)
     with pytest.raises(ValueError, match="60x128 is not divisible by the deepest stride 8"):
-        build_model(replace(TINY, recipe=replace(TINY.recipe, data=data)), CITYSCAPES20)
+        built(replace(TINY, recipe=replace(TINY.recipe, data=data)))
 
 
 def test_missing_weights_file():
     with pytest.raises(ValueError, match=r"no weights file 'nowhere\.pth'"):
-        build_model(replace(PAPER, pretrained="nowhere.pth"), CITYSCAPES20)
+        built(replace(PAPER, pretrained="nowhere.pth"))
 
 
 def test_weights_file_is_loaded(tmp_path):
@@ -138,16 +149,16 @@ def test_weights_file_is_loaded(tmp_path):
     path = tmp_path / "mnasnet.pth"
     torch.save(reference.state_dict(), path)
     cell = replace(PAPER, backbone="mnasnet", pretrained=str(path), tasks=("panoptic",))
-    backbone = build_model(cell, CITYSCAPES20).net.backbone
+    backbone = built(cell).net.backbone
     assert torch.equal(backbone.pyramid.conv_stem.weight, reference.conv_stem.weight)
 
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_every_recipe_builds(name):
     cell = Cell(load_recipe(name), backbone="resnet18", method="fixed")
-    assert count(build_model(cell, CITYSCAPES20)) > 10_000
+    assert count(built(cell)) > 10_000
 
 
 def test_the_cityscapes_recipe_is_the_papers_network():
-    model = build_model(replace(PAPER, recipe=load_recipe("cityscapes")), CITYSCAPES20)
+    model = built(replace(PAPER, recipe=load_recipe("cityscapes")))
     assert inference_count(model) == 17_843_008

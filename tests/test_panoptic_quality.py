@@ -13,9 +13,15 @@ from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.evaluate.delta import delta_flat, delta_task
-from mtl_bench.evaluate.export_predictions import write_panoptic
-from mtl_bench.tasks.panoptic.iou import SemanticIoU
-from mtl_bench.tasks.panoptic.quality import VOID, PanopticQuality, Segments, Tally, match
+from mtl_bench.tasks.panoptic.files import write_panoptic
+from mtl_bench.tasks.panoptic.metrics import (
+    VOID,
+    PanopticQuality,
+    Segments,
+    SemanticIoU,
+    Tally,
+    match,
+)
 
 PUBLISHED = Path(__file__).parents[2] / "shared/data/deeplab2_testdata/evaluation"
 

@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from mtl_bench.core import plugins
-from mtl_bench.core.config import Cell, Recipe
+from mtl_bench.core import plugins, provenance, quality
+from mtl_bench.core.config import Cell, Recipe, load_recipe
+from mtl_bench.core.dataset import dataset_of
+from mtl_bench.core.task import tasks_of_cell, terms_of
 
 METHOD = '''"""Doubles everything.
 
@@ -238,3 +240,88 @@ def test_children_find_added_folders_and_describing_imports_nothing(tmp_path):
         "assert 'mine' in names and not {'torch', 'timm'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd="/", env=os.environ)
+
+
+# --- tasks, which are read as text ----------------------------------------------------------------
+
+TASK = '''"""Where surfaces face.
+
+Source: a test.
+"""
+
+from mtl_bench.core.columns import Column
+from mtl_bench.core.task import Task
+from mtl_bench.core.terms import Term
+
+
+class Normals(Task):
+    terms = (Term("angle", "normals", "regression", 1.0),)
+    after = ("depth",)
+    columns = (Column(*("angle", "normals.angle", "Angle", -1, 1), unit="deg", headline=True),)
+'''
+
+
+def test_a_further_task_changes_no_cell_that_does_not_name_it(tmp_path):
+    cells = [Cell(load_recipe(name), "tiny", "fixed") for name in ("smoke", "kitti", "paper")]
+    before = [(cell.id, provenance.code(cell), cell.tasks) for cell in cells]
+    terms = [term.name for term in terms_of(tasks_of_cell(cells[0]))]
+    put(tmp_path / "extra" / "tasks" / "normals.py", TASK)
+    plugins.add_folder("extra")
+    assert "normals" in plugins.files("tasks")
+    again = [Cell(load_recipe(name), "tiny", "fixed") for name in ("smoke", "kitti", "paper")]
+    assert [(cell.id, provenance.code(cell), cell.tasks) for cell in again] == before
+    assert [term.name for term in terms_of(tasks_of_cell(again[0]))] == terms
+    three = replace(cells[0], tasks=("normals", "depth", "panoptic"))
+    plugins.check_cells([three])
+    assert three.id != cells[0].id
+    names = [task.name for task in tasks_of_cell(three)]
+    assert names == ["panoptic", "depth", "normals"]
+    assert set(provenance.code(three)["train"]) == {
+        *("method", "backbone", "harness", "tasks/normals.py")
+    }
+    assert dataset_of(three.recipe).name == "synthetic"
+
+
+def test_tasks_stand_behind_those_whose_results_they_read(tmp_path):
+    for name, after in (("aaa", ("zzz", "absent")), ("mmm", ()), ("zzz", ("mmm",))):
+        put(tmp_path / "tasks" / f"{name}.py", TASK.replace('("depth",)', repr(after)))
+    assert plugins.ordered(["zzz", "aaa", "mmm"]) == ["mmm", "zzz", "aaa"]
+    assert plugins.ordered(["aaa", "mmm"]) == ["aaa", "mmm"]  # what is not there is not waited for
+    assert plugins.ordered(["depth", "panoptic"]) == ["panoptic", "depth"]
+    assert plugins.ordered([]) == []
+    with pytest.raises(ValueError, match=r"no task called 'dept' \(did you mean 'depth'\?\)"):
+        plugins.ordered(["dept"])
+    put(tmp_path / "tasks" / "mmm.py", TASK.replace('("depth",)', "('aaa',)"))
+    with pytest.raises(ValueError, match=r"tasks wait for each other: .*mmm"):
+        plugins.ordered(["aaa", "mmm", "zzz"])
+
+
+def test_columns_are_read_without_running_a_task(tmp_path):
+    shipped = quality.quality()
+    put(tmp_path / "tasks" / "normals.py", TASK + "\nraise RuntimeError('was run')\n")
+    found = quality.quality()
+    assert found[: len(shipped)] == shipped
+    (angle,) = found[len(shipped) :]
+    assert (angle.name, angle.key, angle.better, angle.digits) == ("angle", "normals.angle", -1, 1)
+    assert (angle.task, angle.unit, angle.headline) == ("normals", "deg", True)
+    assert [column.task for column in shipped] == sorted(
+        (column.task for column in shipped), key=["panoptic", "depth"].index
+    )
+    assert [column.name for column in quality.in_brief() if column.headline] == [
+        *("pq", "rmse", "angle")
+    ]
+    put(tmp_path / "tasks" / "broken.py", "def (:")  # hurts nobody else
+    assert quality.quality() == found
+
+
+@pytest.mark.parametrize(
+    "columns",
+    ["(Column(open('x')),)", "(other(),)", "[Column(*MORE)]", "tuple(Column() for _ in 'ab')"],
+)
+def test_columns_are_nothing_but_values(tmp_path, columns):
+    put(
+        tmp_path / "tasks" / "normals.py",
+        TASK.partition("    columns")[0] + f"    columns = {columns}\n",
+    )
+    with pytest.raises(ValueError, match=r"task 'normals': columns are a tuple of Column"):
+        quality.quality()

@@ -1,18 +1,21 @@
 """Point clouds: the built-in scene's own geometry comes out of the files again."""
 
 import errno
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mtl_bench.core.view import METRES
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.data.scenes.cityscapes import write_scene
 from mtl_bench.data.scenes.settings import Settings
-from mtl_bench.show import predict
 from mtl_bench.show.predict import Predicted
 from mtl_bench.show.predict.point_cloud import from_maps, from_prediction, write_npz, write_ply
+from mtl_bench.tasks.depth.picture import HEIGHTS, DepthView
+from mtl_bench.tasks.panoptic.picture import PanopticView
 
 ROAD, CAR, SKY, EGO = 7, 26, 23, 1
 
@@ -43,7 +46,7 @@ def vertices(frame, tmp_path_factory):
     """What somebody else's reader finds in the file."""
     plyfile = pytest.importorskip("plyfile")
     image, depth_m, ids, camera = frame
-    cloud = from_maps(image, depth_m, ids, matrix(camera), CITYSCAPES20, predict.METRES)
+    cloud = from_maps(image, depth_m, ids, matrix(camera), CITYSCAPES20, METRES)
     path = tmp_path_factory.mktemp("ply") / "scene.ply"
     write_ply(path, cloud, CITYSCAPES20)
     data = plyfile.PlyData.read(str(path))
@@ -86,19 +89,19 @@ def test_sky_ego_vehicle_and_invalid_depth_are_left_out():
     depth = np.array([[4.0, 900, 2, 8, 5, 0, np.nan]])
     image = np.arange(21, dtype=np.uint8).reshape(1, 7, 3)
     K = np.array([[10.0, 0, 3], [0, 20, 0], [0, 0, 1]])
-    cloud = from_maps(image, depth, ids, K, CITYSCAPES20, predict.METRES)
+    cloud = from_maps(image, depth, ids, K, CITYSCAPES20, METRES)
     assert cloud.class_N.tolist() == [ROAD, CAR, 0]
     assert cloud.instance_N.tolist() == [0, 26003, 0]
     assert cloud.ids_N.tolist() == [ROAD, 26003, 0]
     assert np.allclose(cloud.points_N3, [[-1.2, 0, 4], [0, 0, 8], [0.5, 0, 5]])
     assert cloud.colors_N3.tolist() == image[0, [0, 3, 4]].tolist()
-    kitti = from_maps(image, depth, ids, K, CITYSCAPES19, predict.METRES)
+    kitti = from_maps(image, depth, ids, K, CITYSCAPES19, METRES)
     assert kitti.class_N.tolist() == [ROAD, EGO, CAR, 0], "a label set without ego vehicle"
 
 
 def test_arrays_hold_what_the_ply_file_holds(frame, vertices, tmp_path):
     image, depth_m, ids, camera = frame
-    cloud = from_maps(image, depth_m, ids, matrix(camera), CITYSCAPES20, predict.METRES)
+    cloud = from_maps(image, depth_m, ids, matrix(camera), CITYSCAPES20, METRES)
     write_npz(tmp_path / "cloud.npz", cloud)
     with np.load(tmp_path / "cloud.npz", allow_pickle=False) as data:
         assert (data["points"] == np.stack([vertices[name] for name in "xyz"], 1)).all()
@@ -110,27 +113,25 @@ def test_arrays_hold_what_the_ply_file_holds(frame, vertices, tmp_path):
 
 def test_a_cloud_takes_depth():
     image, K = np.zeros((2, 3, 3), np.uint8), np.eye(3)
-    without = Predicted(image, K, np.full((2, 3), 7, np.int32), None, None, None, None, None)
+    without = Predicted(image, K, (PanopticView(np.full((2, 3), 7, np.int32), CITYSCAPES20),))
     with pytest.raises(ValueError, match="no depth is predicted"):
         from_prediction(without, CITYSCAPES20)
     depth = np.ones((2, 3), np.float32)
-    alone = Predicted(image, K, None, None, depth, predict.HEIGHTS, "normals", 1.0)
+    alone = Predicted(image, K, (DepthView(depth, HEIGHTS, "normals", 1.0),))
     cloud = from_prediction(alone, CITYSCAPES20)
     assert (cloud.class_N == 0).all()
     assert len(cloud) == 6
-    assert cloud.unit == predict.HEIGHTS
+    assert cloud.unit == HEIGHTS
 
 
 def test_a_full_disk_leaves_no_file(frame, tmp_path, monkeypatch):
     image, depth_m, ids, camera = frame
-    cloud = from_maps(image, depth_m, ids, matrix(camera), CITYSCAPES20, predict.METRES)
-    whole = Path.write_bytes
+    cloud = from_maps(image, depth_m, ids, matrix(camera), CITYSCAPES20, METRES)
 
-    def full(path, data):
-        whole(path, data[:100])
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
         write_ply(tmp_path / "cloud.ply", cloud, CITYSCAPES20)
     assert not list(tmp_path.iterdir())

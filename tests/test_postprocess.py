@@ -11,11 +11,14 @@ import torch
 
 from mtl_bench.core import config
 from mtl_bench.core.labels import IGNORE
+from mtl_bench.core.recipe import Recipe
+from mtl_bench.core.task import tasks_of
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.model import Outputs
+from mtl_bench.tasks import pixels
 from mtl_bench.tasks.depth import scale as depth_scale
-from mtl_bench.tasks.panoptic import postprocess
-from mtl_bench.tasks.panoptic.quality import PanopticQuality
+from mtl_bench.tasks.depth.scale import dgc_scale
+from mtl_bench.tasks.panoptic import grouping
+from mtl_bench.tasks.panoptic.metrics import PanopticQuality
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 THINGS = CITYSCAPES20.things
@@ -49,10 +52,10 @@ def reference(class_HW, heat_HW, offset_2HW, things, ev):
                 at_x = np.float32(x) + offset_2HW[1, y, x]
                 distances = [(at_y - cy) ** 2 + (at_x - cx) ** 2 for cy, cx in centers]
                 members.setdefault(int(np.argmin(distances)), []).append((y, x))
-    for index, pixels in members.items():
-        votes = Counter(class_HW[pixel] for pixel in pixels)
+    for index, members_of in members.items():
+        votes = Counter(class_HW[pixel] for pixel in members_of)
         winner = min(votes, key=lambda c: (-votes[c], c))
-        for pixel in pixels:
+        for pixel in members_of:
             result[pixel] = winner * 1000 + index + 1
     for label in range(len(CITYSCAPES20)):
         area = (class_HW == label).sum()
@@ -80,7 +83,7 @@ def test_equals_the_rules_on_random_maps_full_of_ties(seed, ev):
     heat = (rng.integers(0, 5, shape) / 4).astype(np.float32)  # plateaus, equal peaks
     heat[0] *= seed % 2  # half of the time an image without centers beside others that have some
     offset = rng.integers(-4, 5, (3, 2, 15, 18)).astype(np.float32) / 2  # equal distances
-    result = postprocess.panoptic(
+    result = grouping.panoptic(
         torch.from_numpy(classes),
         torch.from_numpy(heat)[:, None],
         torch.from_numpy(offset),
@@ -100,7 +103,7 @@ def test_images_smaller_than_the_window(size, kernel):
         heat = (rng.integers(0, 4, (2, *size)) / 3).astype(np.float32)
         offset = rng.normal(0, 2, (2, 2, *size)).astype(np.float32)
         ev = settings(nms_kernel=kernel)
-        result = postprocess.panoptic(
+        result = grouping.panoptic(
             torch.from_numpy(classes),
             torch.from_numpy(heat)[:, None],
             torch.from_numpy(offset),
@@ -115,8 +118,8 @@ def test_images_smaller_than_the_window(size, kernel):
 def test_nothing_but_void():
     nothing = torch.zeros(2, 2, 6, 6)
     classes = torch.full((2, 6, 6), IGNORE)
-    result = postprocess.panoptic(classes, nothing[:, :1] + 1, nothing, THINGS, settings())
-    assert (result == postprocess.VOID).all()
+    result = grouping.panoptic(classes, nothing[:, :1] + 1, nothing, THINGS, settings())
+    assert (result == grouping.VOID).all()
 
 
 def test_a_batch_is_its_images():
@@ -126,26 +129,26 @@ def test_a_batch_is_its_images():
     heat[2] = 0.1
     offset = 3 * torch.randn(5, 2, 20, 30, generator=generator)
     ev = settings(top_k=6, stuff_area=30)
-    batch = postprocess.panoptic(classes, heat, offset, THINGS, ev)
+    batch = grouping.panoptic(classes, heat, offset, THINGS, ev)
     for i in range(5):
         maps = (classes[i : i + 1], heat[i : i + 1], offset[i : i + 1])
-        assert torch.equal(postprocess.panoptic(*maps, THINGS, ev), batch[i : i + 1])
+        assert torch.equal(grouping.panoptic(*maps, THINGS, ev), batch[i : i + 1])
 
 
 def test_the_stuff_filter_of_an_exported_graph_is_the_same():
     generator = torch.Generator().manual_seed(0)
     classes = torch.randint(0, len(CITYSCAPES20), (3, 9, 14), generator=generator)
     classes[0, 0] = IGNORE
-    counted = postprocess._stuff(postprocess.classes(classes), THINGS, 6)
-    assert torch.equal(counted, postprocess._stuff_by_class(classes.int(), THINGS, 6))
-    assert {0, 1000, postprocess.VOID} < set(counted.unique().tolist())
+    counted = grouping._stuff(grouping.classes(classes), THINGS, 6)
+    assert torch.equal(counted, grouping._stuff_by_class(classes.int(), THINGS, 6))
+    assert {0, 1000, grouping.VOID} < set(counted.unique().tolist())
 
 
 def test_members_may_be_any_classes():
     classes = torch.arange(256)
     for chosen in ((0,), (255,), (3, 1, 2, 9), (0, 1, 254, 255), THINGS):
         for dtype in (torch.uint8, torch.int32, torch.int64):
-            found = postprocess.member(classes.to(dtype), chosen)
+            found = pixels.member(classes.to(dtype), chosen)
             assert found.nonzero()[:, 0].tolist() == sorted(chosen)
 
 
@@ -169,12 +172,11 @@ def one_thread():
 
 def test_200_instances_take_no_twice_the_time_of_5_and_little_memory(one_thread):
     benchmark = load_benchmark()
-    finish = benchmark.finish()
     few, many = (benchmark.scene(count) for count in (5, 200))
     with torch.inference_mode():
-        assert finish(*many)["panoptic"].unique().numel() > 150
+        assert benchmark.whole(*many)["panoptic"].unique().numel() > 150
         times = [
-            [benchmark.milliseconds(lambda s=scene: finish(*s)) for scene in (few, many)]
+            [benchmark.milliseconds(lambda s=scene: benchmark.whole(*s)) for scene in (few, many)]
             for _ in range(5)
         ]
         best_few, best_many = (min(column) for column in zip(*times, strict=True))
@@ -185,7 +187,7 @@ def test_200_instances_take_no_twice_the_time_of_5_and_little_memory(one_thread)
             for name in ("- nearest", "(table)")
         )
         assert nearest < 0.5 * table
-        assert benchmark.peak_mib(lambda: finish(*many)) < 200
+        assert benchmark.peak_mib(lambda: benchmark.whole(*many)) < 200
 
 
 def test_logits_are_the_same_as_their_classes():
@@ -194,7 +196,7 @@ def test_logits_are_the_same_as_their_classes():
     heat = torch.rand(2, 1, 9, 11, generator=generator)
     offset = torch.randn(2, 2, 9, 11, generator=generator)
     results = [
-        postprocess.panoptic(semantic, heat, offset, THINGS, settings())
+        grouping.panoptic(semantic, heat, offset, THINGS, settings())
         for semantic in (logits, logits.argmax(1))
     ]
     assert torch.equal(*results)
@@ -206,7 +208,7 @@ def test_the_least_areas_are_kept():
     nothing = torch.zeros(1, 2, 6, 6)
     for least, expected in ((4, SKY * 1000), (5, -1)):
         ev = settings(stuff_area=least)
-        result = postprocess.panoptic(classes, nothing[:, :1], nothing, THINGS, ev)
+        result = grouping.panoptic(classes, nothing[:, :1], nothing, THINGS, ev)
         assert result[0, 0, 0] == expected
         assert result[0, 5, 5] == ROAD * 1000
 
@@ -216,21 +218,21 @@ def test_equal_neighbours_are_both_centers():
     heat[0, 0, 4, 3:5] = 1.0
     heat[0, 0, 5, 6] = 0.9  # lower, and in their window
     heat[0, 0, 10, 18] = 0.9
-    centers, count = postprocess.find_centers(heat, settings(nms_kernel=5))
+    centers, count = grouping.find_centers(heat, settings(nms_kernel=5))
     assert count.tolist() == [3]
     assert centers.tolist() == [[[4, 3], [4, 4], [10, 18]]]
 
 
 def test_an_even_kernel_is_refused():
     with pytest.raises(ValueError, match="nms_kernel must be odd, not 4"):
-        postprocess.find_centers(torch.zeros(1, 1, 8, 8), settings(nms_kernel=4))
+        grouping.find_centers(torch.zeros(1, 1, 8, 8), settings(nms_kernel=4))
 
 
 def test_instance_ids_are_cityscapes_own():
     panoptic = torch.tensor(
         [[[-1, ROAD * 1000, 0, CAR * 1000 + 7, CAR * 1000, PERSON * 1000 + 200]]]
     )
-    ids = postprocess.to_instance_ids(panoptic, CITYSCAPES20)
+    ids = grouping.to_instance_ids(panoptic, CITYSCAPES20)
     assert ids.dtype == torch.int32
     assert ids.tolist() == [[[0, 7, 0, 26007, 26, 24200]]]
 
@@ -245,7 +247,7 @@ def test_truth_to_targets_to_grouping_is_perfect():
         ids[y : y + 14, x : x + 21] = label * 1000 + number
     ids[70:80, 60:80] = 26  # a crowd: has no center, so grouping gives it to a neighbour
     targets = panoptic_targets(ids, CITYSCAPES20, config.Loss(center_sigma=4))
-    panoptic = postprocess.panoptic(
+    panoptic = grouping.panoptic(
         torch.from_numpy(targets.semantic)[None],
         torch.from_numpy(targets.center)[None, None],
         torch.from_numpy(targets.offset)[None],
@@ -253,7 +255,7 @@ def test_truth_to_targets_to_grouping_is_perfect():
         settings(nms_kernel=7),
     )
     quality = PanopticQuality(CITYSCAPES20)
-    predicted = postprocess.to_instance_ids(panoptic, CITYSCAPES20)[0].numpy()
+    predicted = grouping.to_instance_ids(panoptic, CITYSCAPES20)[0].numpy()
     predicted[ids == 26] = 0
     quality.update(predicted, ids)
     result = quality.compute()
@@ -262,15 +264,14 @@ def test_truth_to_targets_to_grouping_is_perfect():
 
 
 def test_resize_scales_offsets_and_keeps_linear_inverse_depth():
+    panoptic, depth = tasks_of(Recipe(), ("panoptic", "depth"), CITYSCAPES20)
     rows = torch.linspace(0.1, 1.0, 8)[:, None].expand(8, 16)[None, None]
-    outputs = Outputs(
-        offset_B2HW=torch.full((1, 2, 8, 16), 3.0), center_B1HW=rows, inverse_depth=[rows]
-    )
-    larger = postprocess.resize(outputs, 16, 48)
-    assert larger.semantic_BCHW is None
-    assert torch.allclose(larger.offset_B2HW[0, 0], torch.tensor(6.0))
-    assert torch.allclose(larger.offset_B2HW[0, 1], torch.tensor(9.0))
-    column = larger.inverse_depth[0][0, 0, 1:-1, 0]
+    maps = {"offset": torch.full((1, 2, 8, 16), 3.0), "center": rows}
+    larger = panoptic.resized(maps, (16, 48))
+    assert set(larger) == {"offset", "center"}
+    assert torch.allclose(larger["offset"][0, 0], torch.tensor(6.0))
+    assert torch.allclose(larger["offset"][0, 1], torch.tensor(9.0))
+    column = depth.resized({"inverse": rows}, (16, 48))["inverse"][0, 0, 1:-1, 0]
     assert torch.allclose(column.diff(), torch.tensor(0.9 / 7 / 2), atol=1e-6)
 
 
@@ -279,66 +280,42 @@ def test_resize_scales_offsets_and_keeps_linear_inverse_depth():
 FOCAL, HEIGHT, WIDTH = 115.0, 64, 128
 
 
-def plane(camera_m=1.4, pitch=0.0, roll=0.0, height=HEIGHT, width=WIDTH):
-    """True depth of a road below a tilted camera, 60 m of sky elsewhere; K; where the road is."""
+def plane(camera_m=1.4, pitch=0.0, height=HEIGHT, width=WIDTH):
+    """True depth of a road below a pitched camera, 60 m of sky elsewhere; K; where the road is."""
     focal = FOCAL * width / WIDTH
     K = torch.tensor([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    ray_x, ray_y = (x - K[0, 2]) / focal, (y - K[1, 2]) / focal
-    normal = torch.tensor(
-        [math.sin(roll), math.cos(roll) * math.cos(pitch), math.cos(roll) * math.sin(pitch)]
-    )
-    rate = (normal[0] * ray_x + normal[1] * ray_y + normal[2]) / camera_m
+    y = torch.arange(height)[:, None].expand(height, width)
+    ray_y = (y - K[1, 2]) / focal
+    rate = (math.cos(pitch) * ray_y + math.sin(pitch)) / camera_m
     road = rate > 1 / 60
     return torch.where(road, 1 / rate.clamp(min=1e-6), 60.0)[None, None], K[None], road[None]
 
 
-@pytest.mark.parametrize(
-    ("pitch", "roll"), [(0.0, 0.0), (0.05, 0.0), (-0.03, 0.0), (0.0, 0.04), (0.04, -0.02)]
-)
+@pytest.mark.parametrize("pitch", [0.0, 0.05, -0.03, 0.08])
 @pytest.mark.parametrize("size", [(64, 128), (400, 900)], ids=["small", "subsampled"])
-def test_scale_is_exact_on_a_plane(pitch, roll, size):
-    depth, K, road = plane(pitch=pitch, roll=roll, height=size[0], width=size[1])
-    scale, source = postprocess.dgc_scale(
-        depth / 3.3, K, torch.tensor([1.4]), road, max_tilt=depth_scale.MAX_TILT
+def test_scale_is_exact_on_a_plane(pitch, size):
+    depth, K, road = plane(pitch=pitch, height=size[0], width=size[1])
+    scale, source = dgc_scale(
+        depth / 3.3, K, torch.tensor([1.4]), road, pitch_rad_B=torch.tensor([pitch])
     )
-    assert source.tolist() == [postprocess.ROAD]
+    assert source.tolist() == [depth_scale.ROAD]
     assert scale.item() == pytest.approx(3.3, rel=1e-4)
 
 
-def test_a_known_pitch_needs_no_search():
-    depth, K, road = plane(pitch=0.08)  # more than is searched for
-    pitch = torch.tensor([0.08])
-    for max_tilt in (0.0, depth_scale.MAX_TILT):
-        scale, _ = postprocess.dgc_scale(
-            depth / 2, K, torch.tensor([1.4]), road, max_tilt=max_tilt, pitch_rad_B=pitch
-        )
-        assert scale.item() == pytest.approx(2.0, rel=1e-4)
-    unknown, _ = postprocess.dgc_scale(depth / 2, K, torch.tensor([1.4]), road)
+def test_a_pitch_that_is_not_told_is_taken_for_none():
+    depth, K, road = plane(pitch=0.08)
+    unknown, _ = dgc_scale(depth / 2, K, torch.tensor([1.4]), road)
     assert unknown.item() > 2.4
-
-
-def test_a_pitch_that_is_off_is_corrected():
-    depth, K, road = plane(pitch=0.05, roll=0.02)
-    scale, _ = postprocess.dgc_scale(
-        depth,
-        K,
-        torch.tensor([1.4]),
-        road,
-        max_tilt=depth_scale.MAX_TILT,
-        pitch_rad_B=torch.tensor([0.03]),
-    )
-    assert scale.item() == pytest.approx(1.0, rel=1e-4)
 
 
 def test_scale_without_a_road_comes_from_horizontal_surfaces():
     depth, K, _ = plane(pitch=0.03)
     depth[..., :, 90:] = 9.0  # a wall that faces the camera
     for road in (None, torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)):
-        scale, source = postprocess.dgc_scale(
-            depth / 0.7, K, torch.tensor([1.4]), road, max_tilt=depth_scale.MAX_TILT
+        scale, source = dgc_scale(
+            depth / 0.7, K, torch.tensor([1.4]), road, pitch_rad_B=torch.tensor([0.03])
         )
-        assert source.tolist() == [postprocess.NORMALS]
+        assert source.tolist() == [depth_scale.NORMALS]
         assert scale.item() == pytest.approx(0.7, rel=1e-4)
 
 
@@ -347,8 +324,8 @@ def test_each_image_has_its_own_scale_and_a_wall_has_none():
     batch = torch.cat([depth / 2, torch.full_like(depth, 9.0), depth / 4])
     masks = torch.cat([road, torch.zeros_like(road), road])
     heights = torch.tensor([1.4, 1.4, 2.8])
-    scale, source = postprocess.dgc_scale(batch, K.expand(3, 3, 3), heights, masks)
-    assert source.tolist() == [postprocess.ROAD, postprocess.FAILED, postprocess.ROAD]
+    scale, source = dgc_scale(batch, K.expand(3, 3, 3), heights, masks)
+    assert source.tolist() == [depth_scale.ROAD, depth_scale.FAILED, depth_scale.ROAD]
     assert scale[[0, 2]].tolist() == pytest.approx([2.0, 8.0], rel=1e-4)
     assert scale[1].isnan()
 
@@ -360,20 +337,10 @@ def test_noise_and_wrong_road_pixels_move_the_scale_little():
     generator = torch.Generator().manual_seed(0)
     noisy = depth * (1 + 0.1 * torch.randn(depth.shape, generator=generator))
     height = torch.full((20,), 1.4)
-    scale, _ = postprocess.dgc_scale(noisy, K, height, road, max_tilt=depth_scale.MAX_TILT)
+    scale, _ = dgc_scale(noisy, K, height, road, pitch_rad_B=torch.full((20,), 0.02))
     assert scale.mean().item() == pytest.approx(1.0, abs=0.02)
     assert scale.std().item() < 0.03
 
     noisy[..., 40:56, 10:40] *= 0.6  # a car that was taken for road
-    scale, _ = postprocess.dgc_scale(noisy, K, height, road, max_tilt=depth_scale.MAX_TILT)
+    scale, _ = dgc_scale(noisy, K, height, road, pitch_rad_B=torch.full((20,), 0.02))
     assert scale.mean().item() == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_bend_of_the_depth_cannot_tilt_the_camera_far():
-    depth, K, road = plane()
-    bent = depth**0.5  # nothing like a plane
-    height = torch.tensor([1.4])
-    free, _ = postprocess.dgc_scale(bent, K, height, road, max_tilt=depth_scale.MAX_TILT)
-    level, _ = postprocess.dgc_scale(bent, K, height, road)
-    lowest_ray = depth_scale.BELOW_HORIZON * (HEIGHT - 1) / 2 / FOCAL
-    assert level.item() / (1 + depth_scale.MAX_TILT / lowest_ray) < free.item() < level.item()

@@ -17,18 +17,19 @@ from conftest import SHARED
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench.bench import store
-from mtl_bench.core.files import write_json
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Cell, load_recipe, to_dict
+from mtl_bench.core.files import write_json
 from mtl_bench.core.geometry import scale_intrinsics
 from mtl_bench.core.labels import IGNORE
+from mtl_bench.core.task import tasks_of, tasks_of_cell
+from mtl_bench.core.view import METRES
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.model import Outputs, build_model
-from mtl_bench.show import predict
-from mtl_bench.show.predict import HEIGHTS, METRES, UNSCALED, Predictor, video
+from mtl_bench.show.predict import Predictor, video
 from mtl_bench.show.predict import job as predictions
 from mtl_bench.show.predict.cameras import Given, camera_of
+from mtl_bench.tasks.depth.picture import HEIGHTS, UNSCALED
 
 ROAD, SKY, EGO = (CITYSCAPES20.index(name) for name in ("road", "sky", "ego vehicle"))
 RUNNER = CliRunner()
@@ -61,14 +62,15 @@ class Street(nn.Module):
             classes, inverse = torch.full_like(classes, 3), torch.full_like(inverse, 0.1)
         semantic = nn.functional.one_hot(classes, len(CITYSCAPES20)).permute(2, 0, 1)[None].float()
         flat = torch.zeros(1, 1, height, width)
-        return Outputs(semantic, flat, flat.expand(-1, 2, -1, -1), [inverse[None, None]])
+        panoptic = {"semantic": semantic, "center": flat, "offset": flat.expand(-1, 2, -1, -1)}
+        return Outputs({"panoptic": panoptic, "depth": {"inverse": inverse[None, None]}})
 
 
 def street_predictor(size, own, K_33, **options):
     net_K = scale_intrinsics(torch.tensor(K_33)[None], size[1] / own[1], size[0] / own[0])[0]
     street = Street(net_K.numpy(), 1.4, **options)
     model = nn.Module()
-    model.net = street
+    model.net, model.tasks = street, tasks_of_cell(small_cell())
     return Predictor(model, small_cell(), torch.device("cpu"), size), street
 
 
@@ -82,27 +84,29 @@ def test_depth_is_in_metres_at_the_images_own_size():
     predicted = predictor(PHOTO, K, camera_height_m=1.4)
     assert tuple(street.seen.shape) == (1, 3, *SIZE)
     assert 0 <= street.seen.min() < street.seen.max() <= 1
-    assert (predicted.unit, predicted.scale_source) == (METRES, "road")
-    assert predicted.camera_height == 1.4
+    surface = predicted.surface
+    assert (surface.unit, surface.source) == (METRES, "road")
+    assert surface.camera_height == 1.4
     rows = np.arange(90, 140)
     true_m = 1.4 * 280 / (rows - 70)
-    assert np.allclose(predicted.depth_HW[90:140], true_m[:, None], rtol=0.02)
-    assert predicted.depth_HW.shape == OWN
+    assert np.allclose(surface.depth_HW[90:140], true_m[:, None], rtol=0.02)
+    assert surface.depth_HW.shape == OWN
     assert predicted.image_HW3 is PHOTO
 
 
 def test_sky_and_ego_vehicle_have_no_depth_but_a_class():
     predicted = street_predictor(SIZE, OWN, K)[0](PHOTO, K, camera_height_m=1.4)
-    assert (predicted.depth_HW[:66] == 0).all()
-    assert (predicted.depth_HW[-3:] == 0).all()
-    assert (predicted.instance_ids_HW[[20, 100, -1], 200] == (23, 7, 1)).all()
-    assert (predicted.class_HW[[20, 100, -1], 200] == (SKY, ROAD, EGO)).all()
-    assert predicted.instance_ids_HW.dtype == np.int32
+    assert (predicted.surface.depth_HW[:66] == 0).all()
+    assert (predicted.surface.depth_HW[-3:] == 0).all()
+    segments = predicted.segments
+    assert (segments.ids_HW[[20, 100, -1], 200] == (23, 7, 1)).all()
+    assert (segments.class_HW[[20, 100, -1], 200] == (SKY, ROAD, EGO)).all()
+    assert segments.ids_HW.dtype == np.int32
 
 
 def test_without_a_height_depth_is_in_camera_heights():
-    metric = street_predictor(SIZE, OWN, K)[0](PHOTO, K, camera_height_m=1.4)
-    relative = street_predictor(SIZE, OWN, K, unit=9.0)[0](PHOTO, K)
+    metric = street_predictor(SIZE, OWN, K)[0](PHOTO, K, camera_height_m=1.4).surface
+    relative = street_predictor(SIZE, OWN, K, unit=9.0)[0](PHOTO, K).surface
     assert relative.unit == HEIGHTS
     assert relative.camera_height == 1
     assert np.allclose(relative.depth_HW * 1.4, metric.depth_HW, rtol=1e-3)
@@ -110,31 +114,31 @@ def test_without_a_height_depth_is_in_camera_heights():
 
 def test_without_ground_depth_stays_in_the_networks_unit():
     predicted = street_predictor(SIZE, OWN, K, wall=True)[0](PHOTO, K, camera_height_m=1.4)
-    assert (predicted.unit, predicted.scale_source) == (UNSCALED, "failed")
-    assert predicted.camera_height is None
-    assert np.allclose(predicted.depth_HW, 10)
+    surface = predicted.surface
+    assert (surface.unit, surface.source) == (UNSCALED, "failed")
+    assert surface.camera_height is None
+    assert np.allclose(surface.depth_HW, 10)
 
 
 def test_what_is_void_has_no_class():
     predictor = street_predictor(SIZE, OWN, K)[0]
-    evaluate = replace(predictor.cell.recipe.evaluate, stuff_area=10**6)
-    predictor.cell = replace(
-        predictor.cell, recipe=replace(predictor.cell.recipe, evaluate=evaluate)
-    )
+    recipe = predictor.cell.recipe
+    recipe = replace(recipe, evaluate=replace(recipe.evaluate, stuff_area=10**6))
+    predictor.model.tasks = tasks_of(recipe, predictor.cell.tasks, CITYSCAPES20)
     predicted = predictor(PHOTO, K)
-    assert set(np.unique(predicted.class_HW)) == {EGO, IGNORE}
-    assert (predicted.depth_HW[:66] == 0).all(), "a small sky is still no surface"
+    assert set(np.unique(predicted.segments.class_HW)) == {EGO, IGNORE}
+    assert (predicted.surface.depth_HW[:66] == 0).all(), "a small sky is still no surface"
 
 
 def test_pixels_of_the_post_processing_are_the_recipes():
-    cell = small_cell()
-    ev = cell.recipe.evaluate
-    assert predict._for_size(cell, (64, 128)) == cell
-    larger = predict._for_size(cell, (512, 1024)).recipe.evaluate
+    (task,) = tasks_of_cell(small_cell(tasks=("panoptic",)))
+    ev = task.recipe.evaluate
+    assert task.at_size((64, 128)).recipe == task.recipe
+    larger = task.at_size((512, 1024)).recipe.evaluate
     assert larger.stuff_area == 64 * ev.stuff_area
     assert larger.nms_kernel % 2 == 1
     assert abs(larger.nms_kernel - 8 * ev.nms_kernel) <= 1
-    assert predict._for_size(cell, (16, 16)).recipe.evaluate.nms_kernel == 3
+    assert task.at_size((16, 16)).recipe.evaluate.nms_kernel == 3
 
 
 def test_the_size_must_suit_the_network():
@@ -295,7 +299,8 @@ def write_run(folder, cell, labels=CITYSCAPES20):
     torch.manual_seed(0)
     folder.mkdir()
     write_json(folder / "cell.json", to_dict(cell))
-    state = {"format": 1, "model": build_model(cell, labels).state_dict()}
+    tasks = tasks_of(cell.recipe, cell.tasks, labels)
+    state = {"format": 1, "model": build_model(cell, tasks).state_dict()}
     torch.save(state, folder / "last.pt")
     return folder
 
@@ -347,6 +352,9 @@ def test_only_what_is_asked_for_is_written(run, tree):
     out = tree.root / "out"
     assert command(run, tree.plain, "--out", out, "--what", "ids", "-q").output == ""
     assert {path.name for path in out.iterdir()} == {"prediction.json", "plain_instanceIds.png"}
+    assert command(run, tree.plain, "--out", out / "b", "--what", "depth", "-q").output == ""
+    names = {"prediction.json", "plain_depth.png", "plain_depth_colors.png"}
+    assert {path.name for path in (out / "b").iterdir()} == names
 
 
 def test_a_cell_of_one_task_predicts_that(tree, tmp_path):

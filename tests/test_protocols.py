@@ -9,19 +9,19 @@ import torch
 from torch import nn
 
 from mtl_bench.core import config
+from mtl_bench.core.batch import Batch, Camera, collate
 from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data import scenes as synthetic
-from mtl_bench.core.batch import Batch
-from mtl_bench.data.labels import CITYSCAPES19
-from mtl_bench.data.layouts import KITTI
-from mtl_bench.data.loader import open_dataset
-from mtl_bench.evaluate.collector import FLIP, Collector, DepthScore, Prediction
-from mtl_bench.evaluate.walk import evaluate, open_passes, predict
+from mtl_bench.data.kitti import Kitti
+from mtl_bench.data.samples import open_samples
+from mtl_bench.evaluate import walk as walks
+from mtl_bench.evaluate.walk import Walk, evaluate, measure, predict
 from mtl_bench.model import Outputs
-from mtl_bench.tasks.depth import protocols
-from mtl_bench.tasks.depth.errors import NAMES, evaluation_mask
+from mtl_bench.tasks.depth import FLIP, DepthMetric, protocols
+from mtl_bench.tasks.depth.metrics import NAMES, evaluation_mask
 from mtl_bench.tasks.depth.protocols import NAMED, Protocol
-from mtl_bench.tasks.panoptic import postprocess
+from mtl_bench.tasks.depth.scale import ROAD
 
 CPU = torch.device("cpu")
 KITTI_FRAME, CITYSCAPES_FRAME = (375, 1242), (1024, 2048)
@@ -88,9 +88,13 @@ def expected_errors(predicted_3, weights_3):
 
 
 def measured(name, predicted, true_m, dgc=1.0):
-    score = DepthScore(NAMED[name])
-    score.update(predicted, true_m, dgc, postprocess.ROAD)
-    return score.metrics()
+    metric = DepthMetric(NAMED[name])
+    metric.update({"depth_m": true_m}, {"depth": predicted[None], "scale": dgc, "source": ROAD})
+    return metric.compute()
+
+
+def open_walks(cell, root, split=None):
+    return walks.open_walks(cell.recipe, tasks_of_cell(cell), root, split)
 
 
 def spoiled(predicted, name):
@@ -142,7 +146,7 @@ def test_predictions_are_clamped_after_scaling():
 
 def test_a_recipe_without_the_setting_is_measured_as_ever():
     cell = cell_of("synthetic")
-    (main,) = protocols.of_cell(cell)
+    (main,) = protocols.of_recipe(cell.recipe)
     assert main == NAMED["full-frame"]
     values = json.loads(config.canonical_json(cell))["recipe"]
     assert not {"protocol", "also", "flip"} & set(values["evaluate"])
@@ -151,11 +155,11 @@ def test_a_recipe_without_the_setting_is_measured_as_ever():
 
 def test_what_is_not_as_published_says_so():
     cell = cell_of("kitti", protocol="eigen-improved", also=("eigen-raw",))
-    main, raw = protocols.of_cell(cell)
+    main, raw = protocols.of_recipe(cell.recipe)
     assert (main.split, main.title) == ("val", "eigen-improved (split val)")
     assert raw == NAMED["eigen-raw"]
     nearer = cell_of("synthetic", depth_crop="garg", max_depth_m=50.0)
-    (main,) = protocols.of_cell(nearer, "train")
+    (main,) = protocols.of_recipe(nearer.recipe, "train")
     assert main.title == "full-frame (split train, depth_crop garg, max_depth_m 50.0)"
     assert main.record()["name"] == main.title
 
@@ -172,21 +176,33 @@ def test_what_is_not_as_published_says_so():
 )
 def test_wrong_choices_are_named(dataset, settings, message):
     with pytest.raises(ValueError, match=message):
-        protocols.of_cell(cell_of(dataset, **settings))
+        protocols.of_recipe(cell_of(dataset, **settings).recipe)
 
 
-def test_protocols_share_a_pass_where_frames_and_truth_are_the_same():
+def test_protocols_share_a_walk_where_frames_and_truth_are_the_same(monkeypatch):
+    opened = []
+    monkeypatch.setattr(
+        walks, "open_samples", lambda recipe, tasks, *where, **truth: opened.append((where, truth))
+    )
     cell = cell_of("kitti", split="test", protocol="eigen-improved-crop",
                    also=("eigen-raw", "eigen-improved"))  # fmt: skip
-    names = [[p.name for p in group] for group in protocols.passes(protocols.of_cell(cell))]
+    names = [[m.protocol.name for _, m in walk.measured] for walk in open_walks(cell, "root")]
     assert names == [["eigen-improved-crop", "eigen-improved"], ["eigen-raw"]]
-    alone = replace(cell, tasks=("panoptic",))
-    assert [p.name for p in protocols.of_cell(alone)] == ["eigen-improved-crop"]
+    assert opened == [
+        (("test", "root", False), {"truth": "improved"}),
+        (("test", "root", False), {"truth": "velodyne"}),
+    ]
+    (alone,) = open_walks(replace(cell, tasks=("panoptic",)), "root")
+    assert (alone.split, len(alone.measured)) == ("test", 1)
+    both = open_walks(replace(cell, tasks=("panoptic", "depth")), "root")
+    assert [len(walk.measured) for walk in both] == [3, 1]
+    needed = [[task.name for task in walk.tasks] for walk in both]
+    assert needed == [["panoptic", "depth"], ["depth"]]  # raw points are scaled by medians alone
 
 
 def test_shipped_recipes_measure_what_is_published():
     for name in config.recipe_names():
-        for protocol in protocols.of_cell(Cell(load_recipe(name), "none", "none")):
+        for protocol in protocols.of_recipe(load_recipe(name)):
             assert protocol.changed == ()
 
 
@@ -196,12 +212,12 @@ def test_shipped_recipes_measure_what_is_published():
 class Seer(nn.Module):
     """Knows every frame's depth by its image; sees road everywhere below the middle."""
 
-    def __init__(self, datasets, unit=1.0):
+    def __init__(self, cell, samples_of_walks, unit=1.0):
         super().__init__()
-        self.unit, self.calls, self.known = unit, 0, {}
-        for dataset in datasets:
-            for index in range(len(dataset)):
-                sample = dataset.sample(index, None)
+        self.tasks, self.unit, self.calls, self.known = tasks_of_cell(cell), unit, 0, {}
+        for samples in samples_of_walks:
+            for index in range(len(samples)):
+                sample = samples.sample(index, None)
                 self.known.setdefault(sample.image_B3HW.numpy().tobytes(), sample.fields["depth_m"])
         self.net = self.answer
 
@@ -209,13 +225,13 @@ class Seer(nn.Module):
         self.calls += len(image_B3HW)
         depth = torch.stack([self.known[image.numpy().tobytes()] for image in image_B3HW])
         inverse = torch.where(depth > 0, self.unit / depth.clamp(min=0.1), self.unit / 1000)
-        return Outputs(inverse_depth=[inverse[:, None]])
+        return Outputs({"depth": {"inverse": inverse[:, None]}})
 
 
 @pytest.fixture(scope="module")
 def kitti_root(tmp_path_factory):
     out = tmp_path_factory.mktemp("kitti") / "set"
-    return synthetic.write(out, 32, 96, 1, 1, 17, processes=1, progress=False, layout=KITTI)
+    return synthetic.write(out, 32, 96, 1, 1, 17, processes=1, progress=False, layout=Kitti.layout)
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +253,7 @@ def test_a_perfect_predictor_scores_zero(name, kitti_root, cityscapes_root):
     cell = cell_of("synthetic-kitti" if on_kitti else "synthetic",
                    protocol=name, split=protocol.split)  # fmt: skip
     cell = sized(cell, 32, 96 if on_kitti else 64)
-    model = Seer([only.dataset for only in open_passes(cell, root)], unit=7.0)
+    model = Seer(cell, [walk.samples for walk in open_walks(cell, root)], unit=7.0)
     result = evaluate(model, cell, root, CPU)
     assert result.metrics["depth_median.abs_rel"] == pytest.approx(0, abs=1e-6)
     assert result.metrics["depth_median.rmse"] == pytest.approx(0, abs=1e-4)
@@ -257,8 +273,8 @@ def test_further_protocols_stand_beside_the_main_one(kitti_root):
     cell = cell_of("synthetic-kitti", protocol="eigen-improved", split="test",
                    also=("eigen-improved-crop", "eigen-raw"))  # fmt: skip
     cell = sized(cell, 32, 96)
-    main, raw = open_passes(cell, kitti_root)
-    model, calls = Seer([raw.dataset, main.dataset]), []
+    main, raw = open_walks(cell, kitti_root)
+    model, calls = Seer(cell, [raw.samples, main.samples]), []
     result = evaluate(model, cell, kitti_root, CPU, progress=lambda *call: calls.append(call))
     assert model.calls == 16 + 17
     assert calls[0] == (8, 33)
@@ -276,47 +292,67 @@ def test_further_protocols_stand_beside_the_main_one(kitti_root):
     assert also["eigen-raw"]["depth_scalings"] == ["median"]
     assert len(result.samples["names"]) == 4
     json.dumps(result.protocol)
-    alone = evaluate(model, replace(cell, recipe=replace(cell.recipe, evaluate=replace(
-        cell.recipe.evaluate, also=()))), kitti_root, CPU)  # fmt: skip
-    assert alone.metrics == {k: v for k, v in metrics.items() if not k.startswith("eigen")}
+    fewer = replace(cell.recipe.evaluate, also=())
+    alone = replace(cell, recipe=replace(cell.recipe, evaluate=fewer))
+    model.tasks = tasks_of_cell(alone)
+    assert evaluate(model, alone, kitti_root, CPU).metrics == {
+        key: value for key, value in metrics.items() if not key.startswith("eigen")
+    }
 
 
 def test_a_split_of_choice_holds_for_every_protocol(kitti_root):
     cell = cell_of("synthetic-kitti", protocol="eigen-improved", split="test", also=("eigen-raw",))
-    passes = open_passes(sized(cell, 32, 96), kitti_root, "val")
-    assert [only.measured[0].split for only in passes] == ["val", "val"]
-    assert len(passes[0].dataset) == 1
+    found = open_walks(sized(cell, 32, 96), kitti_root, "val")
+    assert [walk.split for walk in found] == ["val", "val"]
+    assert [metric.split for walk in found for _, metric in walk.measured] == ["val", "val"]
+    assert len(found[0].samples) == 1
 
 
 def frame(size, true_m=10.0, ids=None):
-    image = torch.zeros(1, 3, *size)
-    return Batch(
-        names=["frame"],
-        image_B3HW=image,
-        K_B33=torch.eye(3)[None],
-        camera_height_m_B=torch.ones(1),
-        camera_pitch_rad_B=torch.zeros(1),
-        instance_ids_BHW=None if ids is None else torch.full((1, *size), ids),
-        depth_m_BHW=torch.full((1, *size), true_m),
-    )
+    """One evaluation sample."""
+    fields = {"depth_m": torch.full(size, true_m)}
+    if ids is not None:
+        fields["instance_ids"] = torch.full(size, ids, dtype=torch.int32)
+    camera = Camera(torch.eye(3), torch.ones(()), torch.zeros(()))
+    return Batch(["frame"], torch.zeros(3, *size), camera, fields)
 
 
-def prediction_of(size, depth=5.0, **panoptic):
-    return Prediction(
-        depth_B1HW=torch.full((1, 1, *size), depth),
-        dgc_scale_B=torch.ones(1),
-        dgc_source_B=torch.tensor([postprocess.ROAD]),
-        **panoptic,
-    )
+class Frames:
+    """Samples that are given."""
+
+    def __init__(self, *frames):
+        self.frames, self.dataset = frames, Kitti
+
+    def __len__(self):
+        return len(self.frames)
+
+    def sample(self, index, generator):
+        return self.frames[index]
+
+
+def evaluated(cell, *frames):
+    """Road everywhere, at a depth of 5 m."""
+    tasks = tasks_of_cell(cell)
+    measured = [(task, metric) for task in tasks for metric in task.metrics()]
+
+    def results(batch, asked):
+        size = batch.fields["depth_m"].shape[1:]
+        count = len(batch.names)
+        depth = {
+            "depth": torch.full((count, 1, *size), 5.0),
+            "scale": torch.ones(count),
+            "source": torch.full((count,), ROAD),
+        }
+        road = torch.zeros((count, *size), dtype=torch.uint8)
+        return {"depth": depth, "panoptic": {"class": road, "panoptic": road.int()}}
+
+    walk = Walk(cell.recipe.evaluate.split, tasks, measured, Frames(*frames))
+    return measure(cell, [walk], results, CPU)
 
 
 def test_frames_without_truth_are_counted_not_averaged():
     cell = cell_of("synthetic-kitti", protocol="eigen-improved", split="test", also=("eigen-raw",))
-    main, raw = protocols.of_cell(cell)
-    collector = Collector(cell, CITYSCAPES19, 3, [main, raw])
-    for true_m in (10.0, 0.0, 90.0):
-        collector.update(frame((8, 12), true_m), prediction_of((8, 12)))
-    metrics = collector.result("test", CPU).metrics
+    metrics = evaluated(cell, *(frame((8, 12), true_m) for true_m in (10.0, 0.0, 90.0))).metrics
     for prefix in ("", "eigen-raw."):
         assert metrics[f"{prefix}depth.without_truth"] == 2
         assert metrics[f"{prefix}depth_median.images"] == 1
@@ -326,10 +362,7 @@ def test_frames_without_truth_are_counted_not_averaged():
 def test_frames_of_several_sizes():
     """KITTI's days: compared at each one's own size, pictured at the first's."""
     cell = cell_of("kitti", protocol="eigen-improved", split="test")
-    collector = Collector(cell, CITYSCAPES19, 2)
-    for size in ((8, 12), (7, 13)):
-        collector.update(frame(size), prediction_of(size))
-    result = collector.result("test", CPU)
+    result = evaluated(cell, frame((8, 12)), frame((7, 13)))
     assert result.protocol["compared_at"] == [[8, 12], [7, 13]]
     assert result.samples["depth_m"].shape == (2, 8, 12)
     assert result.metrics["depth_dgc.rmse"] == 5.0
@@ -337,15 +370,8 @@ def test_frames_of_several_sizes():
 
 def test_no_panoptic_truth_no_panoptic_metrics():
     cell = cell_of("kitti", tasks=("panoptic", "depth"), protocol="eigen-improved", split="test")
-    size = (8, 12)
-    seen = {
-        "class_BHW": torch.zeros((1, *size), dtype=torch.long),
-        "instance_ids_BHW": torch.full((1, *size), 7, dtype=torch.int32),
-    }
     for ids, said in ((None, "none in this split: no panoptic metrics"), (7, "1 of 1 frames")):
-        collector = Collector(cell, CITYSCAPES19, 1)
-        collector.update(frame(size, ids=ids), prediction_of(size, **seen))
-        result = collector.result("test", CPU)
+        result = evaluated(cell, frame((8, 12), ids=ids))
         assert result.protocol["panoptic_truth"] == said
         assert ("panoptic.pq" in result.metrics) == (ids is not None)
         assert "depth_median.rmse" in result.metrics
@@ -358,8 +384,9 @@ def test_no_panoptic_truth_no_panoptic_metrics():
 class Leaning(nn.Module):
     """Inverse depth that grows to the right, whatever it is shown; its classes follow the image."""
 
-    def __init__(self, width):
+    def __init__(self, cell, width):
         super().__init__()
+        self.tasks = tasks_of_cell(cell)
         self.ramp = torch.linspace(0.1, 0.3, width)
         self.net = self.answer
 
@@ -367,30 +394,38 @@ class Leaning(nn.Module):
         semantic = torch.cat([image_B3HW, 1 - image_B3HW[:, :1]], 1)
         inverse = self.ramp.expand(len(image_B3HW), 1, image_B3HW.shape[2], -1)
         center = torch.zeros_like(inverse)
-        return Outputs(semantic, center, center.repeat(1, 2, 1, 1), [inverse])
+        offset = center.repeat(1, 2, 1, 1)
+        panoptic = {"semantic": semantic, "center": center, "offset": offset}
+        return Outputs({"panoptic": panoptic, "depth": {"inverse": inverse}})
+
+
+def batch_of(image_3HW):
+    return collate([replace(frame((8, 12), ids=7), image_B3HW=image_3HW)])
 
 
 def test_flip_averages_the_inverse_depth_and_nothing_else():
     both = ("panoptic", "depth")
-    image = torch.rand(1, 3, 8, 12, generator=torch.Generator().manual_seed(0))
-    batch = replace(frame((8, 12)), image_B3HW=image)
+    batch = batch_of(torch.rand(3, 8, 12, generator=torch.Generator().manual_seed(0)))
     results = {}
     for flip in (False, True):
         cell = cell_of("kitti", tasks=both, protocol="eigen-raw", split="test", flip=flip)
-        results[flip] = predict(Leaning(12), batch, cell, CITYSCAPES19, (8, 12))
-        collector = Collector(cell, CITYSCAPES19, 1)
-        collector.update(batch, results[flip])
-        said = collector.result("test", CPU).protocol["depth_flip"]
+        model = Leaning(cell, 12)
+        results[flip] = predict(model, batch, model.tasks, (8, 12))
+        said = evaluated(cell, frame((8, 12))).protocol["depth_flip"]
         assert said == (FLIP if flip else "none")
-    assert results[False].depth_B1HW[0, 0, 0, 0] == pytest.approx(10)
-    assert torch.allclose(results[True].depth_B1HW, torch.tensor(5.0))
-    assert torch.equal(results[True].fields["instance_ids"], results[False].fields["instance_ids"])
-    assert torch.equal(results[True].class_BHW, results[False].class_BHW)
+    assert results[False]["depth"]["depth"][0, 0, 0, 0] == pytest.approx(10)
+    assert torch.allclose(results[True]["depth"]["depth"], torch.tensor(5.0))
+    for name in ("class", "panoptic"):
+        assert torch.equal(results[True]["panoptic"][name], results[False]["panoptic"][name])
 
 
 def test_flip_of_a_cell_without_depth_is_nothing():
     cell = cell_of("synthetic", tasks=("panoptic",), flip=True)
-    predict(Leaning(12), frame((8, 12)), cell, CITYSCAPES19, (8, 12))
+    model = Leaning(cell, 12)
+    calls = []
+    model.net = lambda image: calls.append(1) or model.answer(image)
+    predict(model, batch_of(torch.zeros(3, 8, 12)), model.tasks, (8, 12))
+    assert len(calls) == 1
 
 
 def test_records_are_plain():
@@ -401,9 +436,11 @@ def test_records_are_plain():
 
 def test_the_main_dataset_has_the_main_truth(kitti_root):
     cell = sized(cell_of("synthetic-kitti", protocol="eigen-raw", split="test"), 32, 96)
-    (only,) = open_passes(cell, kitti_root)
-    depth = only.dataset.sample(0, None).fields["depth_m"]
-    dense = open_dataset(cell, "test", kitti_root, training=False, truth="improved")
+    (only,) = open_walks(cell, kitti_root)
+    depth = only.samples.sample(0, None).fields["depth_m"]
+    dense = open_samples(
+        cell.recipe, tasks_of_cell(cell), "test", kitti_root, training=False, truth="improved"
+    )
     assert (
         0.2
         < (depth > 0).float().mean()

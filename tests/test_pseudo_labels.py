@@ -19,17 +19,20 @@ from mtl_bench.bench import store
 from mtl_bench.core.files import write_json
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Augment, Cell, Data, Evaluate, Loss, Network, PseudoLabels, Recipe
+from mtl_bench.core.dataset import dataset_of
+from mtl_bench.core.labels import IGNORE, class_of_instance_id
 from mtl_bench.core.plain import to_dict
+from mtl_bench.core.task import tasks_of, tasks_of_cell
+from mtl_bench.data import pseudo_frames
 from mtl_bench.data import scenes as synthetic
 from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, file_of, names_in, read_instance_ids
-from mtl_bench.core.labels import IGNORE
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.data.loader import open_dataset
+from mtl_bench.data.samples import open_samples
 from mtl_bench.data.scenes import render
-from mtl_bench.evaluate import pseudo_frames, pseudo_labels
-from mtl_bench.evaluate.pseudo_labels import RECORD, average, ensure, pass_sizes
+from mtl_bench.evaluate.walk import evaluating
 from mtl_bench.model import Outputs, build_model
-from mtl_bench.core.labels import class_of_instance_id
+from mtl_bench.tasks.panoptic import pseudo_labels
+from mtl_bench.tasks.panoptic.pseudo_labels import RECORD, average, pass_sizes
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 from mtl_bench.train import checkpoint
 
@@ -58,6 +61,29 @@ def with_pseudo(**changes):
     return with_recipe(pseudo=replace(CELL.recipe.pseudo, **changes))
 
 
+def panoptic_of(cell):
+    return tasks_of(cell.recipe, ("panoptic",), CITYSCAPES20)[0]
+
+
+def ensure(model, cell, root, out, progress=None):
+    """Label the training split's frames."""
+    frames = dataset_of(cell.recipe).frames_to_label(root, out, "train", cell.recipe)
+    with evaluating(model):
+        return panoptic_of(cell).label(model, frames, CPU, progress)
+
+
+class Net(nn.Module):
+    """A network that a function stands in for; it gives the panoptic maps."""
+
+    def __init__(self, answer):
+        super().__init__()
+        self.answer = answer
+
+    def forward(self, image_B3HW):
+        names = ("semantic", "center", "offset")
+        return Outputs({"panoptic": dict(zip(names, self.answer(image_B3HW), strict=True))})
+
+
 class Oracle(nn.Module):
     """Outputs made of the instance ids that `ids_of` tells for an image at its size.
 
@@ -69,14 +95,14 @@ class Oracle(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.ones(1))
         self.ids_of, self.doubt, self.seen = ids_of, doubt, 0
-        self.net = self.answer
+        self.net = Net(self.answer)
 
     def answer(self, image_B3HW):
         assert not self.training
         assert torch.is_inference_mode_enabled()
         self.seen += len(image_B3HW)
         maps = zip(*[self.frame(self.ids_of(image)) for image in image_B3HW], strict=True)
-        return Outputs(*(torch.stack(part) for part in maps))
+        return [torch.stack(part) for part in maps]
 
     def frame(self, ids_HW):
         targets = panoptic_targets(ids_HW.astype(np.int32), CITYSCAPES20, CELL.recipe.loss)
@@ -193,7 +219,7 @@ BETWEEN = [f"syn00_{scene:06d}_{frame:06d}" for scene in range(SCENES) for frame
 def test_a_model_that_predicts_the_truth_writes_the_truth(scenes, truth, knowing, tmp_path, flip):
     before = contents(scenes)
     model = knowing()
-    folder = ensure(model, with_pseudo(flip=flip), scenes, tmp_path / "out", CPU)
+    folder = ensure(model, with_pseudo(flip=flip), scenes, tmp_path / "out")
     assert model.seen == len(BETWEEN) * (1 + flip)
     assert folder == tmp_path / "out" / "gtFine" / "train"
     assert sorted(names_in(folder, LABELS)) == BETWEEN
@@ -211,7 +237,7 @@ def test_a_model_that_predicts_the_truth_writes_the_truth(scenes, truth, knowing
 def test_without_human_labels_annotated_frames_are_labelled_too(
     scenes, unlabelled, truth, knowing, tmp_path
 ):
-    folder = ensure(knowing(), CELL, unlabelled, tmp_path / "out", CPU)
+    folder = ensure(knowing(), CELL, unlabelled, tmp_path / "out")
     middle = f"syn00_000000_{FRAMES // 2:06d}"
     assert names_in(folder, LABELS) == {*BETWEEN, middle, middle.replace("000000_", "000001_")}
     human = read_instance_ids(file_of(scenes / "gtFine" / "train", LABELS, middle))
@@ -223,7 +249,7 @@ def test_things_without_a_center_are_a_crowd(scenes, truth, knowing, tmp_path):
     def grouped(ids):
         return np.where(ids < 1000, ids, ids // 1000)
 
-    folder = ensure(knowing(grouped), CELL, scenes, tmp_path / "out", CPU)
+    folder = ensure(knowing(grouped), CELL, scenes, tmp_path / "out")
     for name in BETWEEN:
         np.testing.assert_array_equal(written(folder, name), grouped(truth[name]))
 
@@ -234,7 +260,7 @@ def test_less_certain_pixels_are_left_unlabeled(scenes, truth, knowing, tmp_path
     for limit, expected in ((0.5, 0), (0.04, 1)):  # 20 classes: 0.05 each, the first one wins
         model = knowing(doubt=doubt)
         out = tmp_path / str(limit)
-        folder = ensure(model, with_pseudo(min_confidence=limit), scenes, out, CPU)
+        folder = ensure(model, with_pseudo(min_confidence=limit), scenes, out)
         for name in BETWEEN:
             np.testing.assert_array_equal(
                 written(folder, name), np.where(doubt, expected, truth[name])
@@ -242,7 +268,7 @@ def test_less_certain_pixels_are_left_unlabeled(scenes, truth, knowing, tmp_path
 
 
 def test_the_official_panoptic_writer_accepts_them(scenes, truth, knowing, tmp_path, capsys):
-    ensure(knowing(), CELL, scenes, tmp_path / "out", CPU)
+    ensure(knowing(), CELL, scenes, tmp_path / "out")
     for name in BETWEEN:
         put_png(file_of(tmp_path / "true" / "gtFine" / "train", LABELS, name), truth[name])
     results_of = {}
@@ -256,8 +282,11 @@ def test_the_official_panoptic_writer_accepts_them(scenes, truth, knowing, tmp_p
 
 
 def test_labelled_frames_are_training_samples(scenes, truth, knowing, tmp_path):
-    folder = ensure(knowing(), CELL, scenes, tmp_path / "out", CPU)
-    dataset = open_dataset(CELL, "train", scenes, training=True, sequence_labels=folder)
+    folder = ensure(knowing(), CELL, scenes, tmp_path / "out")
+    tasks = tasks_of_cell(CELL)
+    dataset = open_samples(
+        CELL.recipe, tasks, "train", scenes, training=True, further_labels=folder
+    )
     middle = [f"syn00_{scene:06d}_000002" for scene in range(SCENES)]
     assert dataset.names == sorted([*BETWEEN, *middle])
     name = BETWEEN[1]
@@ -285,39 +314,39 @@ def test_stopped_and_called_again_it_writes_the_rest(
     scenes, knowing, tmp_path, monkeypatch, frames
 ):
     monkeypatch.setattr(pseudo_labels, "PIXELS", 2 * HEIGHT * WIDTH)  # batches of two
-    whole = ensure(knowing(), CELL, scenes, tmp_path / "whole", CPU)
+    whole = ensure(knowing(), CELL, scenes, tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
-        ensure(knowing(), CELL, scenes, tmp_path / "out", CPU, stop_after(frames))
+        ensure(knowing(), CELL, scenes, tmp_path / "out", stop_after(frames))
     folder = tmp_path / "out" / "gtFine" / "train"
     early = {path: path.stat().st_mtime_ns for path in folder.rglob("*.png")}
     assert len(early) == 2 * frames
 
     model, told = knowing(), []
-    assert ensure(model, CELL, scenes, tmp_path / "out", CPU, lambda *n: told.append(n)) == folder
+    assert ensure(model, CELL, scenes, tmp_path / "out", lambda *n: told.append(n)) == folder
     assert told == [(done, 4) for done in range(frames, 5)]
     assert model.seen == {0: 4, 1: 4, 3: 2}[frames]  # whole batches, for the same last bits
     assert {path: path.stat().st_mtime_ns for path in early} == early
     assert contents(folder) == contents(whole)
 
     again = Oracle(never)
-    ensure(again, CELL, scenes, tmp_path / "out", CPU, lambda *n: told.append(n))
+    ensure(again, CELL, scenes, tmp_path / "out", lambda *n: told.append(n))
     assert told[-1] == (4, 4)
     assert again.training, "its mode is as it was"
 
 
 def test_a_frame_counts_once_its_instance_ids_are_there(scenes, knowing, tmp_path, monkeypatch):
-    def fail(path, content, write=pseudo_frames.write):
+    def fail(path, content, write=pseudo_frames._write):
         if path.name.endswith("instanceIds.png"):
             raise KeyboardInterrupt
         write(path, content)
 
     with monkeypatch.context() as patch:
-        patch.setattr(pseudo_frames, "write", fail)
+        patch.setattr(pseudo_frames, "_write", fail)
         with pytest.raises(KeyboardInterrupt):
-            ensure(knowing(), CELL, scenes, tmp_path / "out", CPU)
+            ensure(knowing(), CELL, scenes, tmp_path / "out")
     folder = tmp_path / "out" / "gtFine" / "train"
     assert len(list(folder.rglob("*.png"))) == 1
-    ensure(knowing(), CELL, scenes, tmp_path / "out", CPU)
+    ensure(knowing(), CELL, scenes, tmp_path / "out")
     assert names_in(folder, LABELS) == set(BETWEEN)
 
 
@@ -327,7 +356,7 @@ def test_a_frame_counts_once_its_instance_ids_are_there(scenes, knowing, tmp_pat
 def refused(message, model, cell, root, out):
     before = contents(out) if out.exists() else None
     with pytest.raises(ValueError, match=message) as error:
-        ensure(model, cell, root, out, CPU)
+        ensure(model, cell, root, out)
     assert "\n" not in str(error.value)
     assert (contents(out) if out.exists() else None) == before
 
@@ -350,7 +379,7 @@ def test_not_where_labels_of_unknown_making_are(scenes, unlabelled):
 
 @pytest.fixture
 def begun(scenes, knowing, tmp_path):
-    ensure(knowing(), CELL, scenes, tmp_path / "out", CPU)
+    ensure(knowing(), CELL, scenes, tmp_path / "out")
     return tmp_path / "out"
 
 
@@ -381,7 +410,7 @@ def test_not_among_labels_of_other_weights_or_data(scenes, begun, tmp_path):
 
 def test_what_labels_do_not_depend_on_is_free(scenes, begun):
     cell = with_recipe(replace(CELL, seed=3), evaluate=Evaluate(nms_kernel=3, stuff_area=0))
-    ensure(Oracle(never), cell, scenes, begun, CPU)
+    ensure(Oracle(never), cell, scenes, begun)
 
 
 def test_a_damaged_record_is_named(scenes, begun):
@@ -391,7 +420,6 @@ def test_a_damaged_record_is_named(scenes, begun):
 
 def test_what_cannot_be_labelled(scenes, knowing, tmp_path):
     out = tmp_path / "out"
-    refused("no panoptic task", Oracle(never), replace(CELL, tasks=("depth",)), scenes, out)
     refused("positive", Oracle(never), with_pseudo(scales=(1.0, 0.0)), scenes, out)
     refused("positive", Oracle(never), with_pseudo(scales=()), scenes, out)
     refused("0 to 1, not 1.5", Oracle(never), with_pseudo(min_confidence=1.5), scenes, out)
@@ -402,41 +430,42 @@ def test_what_cannot_be_labelled(scenes, knowing, tmp_path):
     refused("no frame without a human label", Oracle(never), CELL, labelled, out)
     assert not out.exists()
     broken = knowing()
-    broken.net = lambda x: Outputs(
-        *(y * torch.nan for y in vars(broken.answer(x)).values() if len(y))
-    )
+    broken.net = Net(lambda image: [map_ * torch.nan for map_ in broken.answer(image)])
     with pytest.raises(ValueError, match=r"not finite in a frame of .*syn00_000000_000001"):
-        ensure(broken, CELL, scenes, out, CPU)
+        ensure(broken, CELL, scenes, out)
     assert not list(out.rglob("*.png"))
 
 
 # --- scales and mirror images ---------------------------------------------------------------------
 
 
-class Ramps:
+TASK = panoptic_of(CELL)
+
+
+def ramps(image_B3HW):
     """Answers with what is linear across the image, and so survives any bilinear resize: the first
     two channels tell a pixel's place in the scene, whatever the size or side of the view."""
 
-    def __call__(self, image_B3HW):
-        height, width = image_B3HW.shape[2:]
-        x, y = image_B3HW[:, :1], image_B3HW[:, 1:2]
-        side = torch.sign(x[..., -1:] - x[..., :1])
-        offset = torch.cat([(0.3 - y) * height, side * (0.8 - x) * width], 1)
-        return Outputs(torch.cat([x, 1 - x], 1).log(), y / 2 + 0.25, offset)
+    height, width = image_B3HW.shape[2:]
+    x, y = image_B3HW[:, :1], image_B3HW[:, 1:2]
+    side = torch.sign(x[..., -1:] - x[..., :1])
+    offset = torch.cat([(0.3 - y) * height, side * (0.8 - x) * width], 1)
+    return torch.cat([x, 1 - x], 1).log(), y / 2 + 0.25, offset
 
 
 def test_passes_agree_where_the_network_follows_the_image():
     rows, columns = torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5
     y, x = torch.meshgrid(rows / HEIGHT, columns / WIDTH, indexing="ij")
     image = torch.stack([x, y, x * 0])[None]
-    plain = average(Ramps(), image, [(HEIGHT, WIDTH)], flip=False)
-    torch.testing.assert_close(plain.probability_BCHW[:, :1], image[:, :1])
+    plain = average(TASK, Net(ramps), image, [(HEIGHT, WIDTH)], flip=False)
+    torch.testing.assert_close(plain["semantic"][:, :1], image[:, :1])
     inside = np.s_[..., 8:-8, 8:-8]  # borders are extended, which is not linear
     for scales, flip in (((1.0,), True), ((0.5, 1.0, 2.0), False), ((0.5, 1.5), True)):
         cell = with_pseudo(scales=scales)
-        mean = average(Ramps(), image, pass_sizes(cell.recipe), flip)
-        for whole, part in zip(plain, mean, strict=True):
-            torch.testing.assert_close(part[inside], whole[inside], rtol=1e-4, atol=1e-4)
+        mean = average(TASK, Net(ramps), image, pass_sizes(cell.recipe), flip)
+        assert mean.keys() == plain.keys()
+        for name, whole in plain.items():
+            torch.testing.assert_close(mean[name][inside], whole[inside], rtol=1e-4, atol=1e-4)
 
 
 def test_passes_are_averaged():
@@ -447,14 +476,14 @@ def test_passes_are_averaged():
         shape = (1, 1, *image_B3HW.shape[2:])
         logits = torch.full(shape, value).logit()
         offset = torch.full((1, 2, *shape[2:]), 10 * value)
-        return Outputs(torch.cat([logits, logits * 0], 1), torch.full(shape, value), offset)
+        return torch.cat([logits, logits * 0], 1), torch.full(shape, value), offset
 
     image = torch.zeros(1, 3, 16, 32)
-    mean = average(net, image, [(16, 32), (8, 32), (32, 16)], flip=False)
-    torch.testing.assert_close(mean.probability_BCHW[:, 0], torch.full((1, 16, 32), 0.5))
-    torch.testing.assert_close(mean.fields["center"], torch.full((1, 1, 16, 32), 0.5))
+    mean = average(TASK, Net(net), image, [(16, 32), (8, 32), (32, 16)], flip=False)
+    torch.testing.assert_close(mean["semantic"][:, 0], torch.full((1, 16, 32), 0.5))
+    torch.testing.assert_close(mean["center"], torch.full((1, 1, 16, 32), 0.5))
     y, x = 10 * (0.2 + 0.6 * 2 + 0.7 / 2) / 3, 10 * (0.2 + 0.6 + 0.7 * 2) / 3
-    torch.testing.assert_close(mean.fields["offset"][0, :, 0, 0], torch.tensor([y, x]))
+    torch.testing.assert_close(mean["offset"][0, :, 0, 0], torch.tensor([y, x]))
 
 
 def test_passes_have_sizes_that_the_network_divides():
@@ -497,7 +526,7 @@ class StreetOracle(Oracle):
                 maps = [x.flip(-1) for x in maps]
                 maps[2][1] *= -1
             parts.append(maps)
-        return Outputs(*(torch.stack(part) for part in zip(*parts, strict=True)))
+        return [torch.stack(part) for part in zip(*parts, strict=True)]
 
 
 @pytest.fixture
@@ -524,7 +553,7 @@ def streets(tmp_path):
 def test_all_passes_and_sizes_give_the_labels_of_the_plain_one(streets, tmp_path, options, size):
     cell = with_pseudo(**options)
     data = replace(cell.recipe.data, height=size[0], width=size[1])
-    folder = ensure(StreetOracle(), with_recipe(cell, data=data), streets, tmp_path / "out", CPU)
+    folder = ensure(StreetOracle(), with_recipe(cell, data=data), streets, tmp_path / "out")
     for frame in (18, 20):
         ids = written(folder, f"aachen_000000_{frame:06d}")
         np.testing.assert_array_equal(ids, renumbered(street(frame - 17)))
@@ -536,13 +565,19 @@ def test_all_passes_and_sizes_give_the_labels_of_the_plain_one(streets, tmp_path
 @pytest.fixture
 def trained(smoke_cell, tmp_path):
     """A run folder with a checkpoint of the smoke recipe, untrained."""
-    data = replace(smoke_cell.recipe.data, height=HEIGHT // 2, width=WIDTH // 2)
-    cell = with_recipe(smoke_cell, data=data)
-    directory = tmp_path / "run"
+    return run_of(smoke_cell, tmp_path / "run")
+
+
+def run_of(cell, directory):
+    data = replace(cell.recipe.data, height=HEIGHT // 2, width=WIDTH // 2)
+    cell = with_recipe(cell, data=data)
     directory.mkdir()
     write_json(directory / "cell.json", to_dict(cell))
     torch.manual_seed(0)
-    state = {"format": checkpoint.FORMAT, "model": build_model(cell, CITYSCAPES20).state_dict()}
+    state = {
+        "format": checkpoint.FORMAT,
+        "model": build_model(cell, tasks_of_cell(cell)).state_dict(),
+    }
     torch.save(state, directory / "last.pt")
     return directory
 
@@ -585,4 +620,11 @@ def test_wrong_usage_of_the_command(trained, scenes, tmp_path, words, message):
     given = ("--checkpoint", trained, "--data", scenes, "--out", tmp_path / "out")
     output = call(*given, *words, code=2)
     assert message in output.replace("\n", "")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cell_without_a_task_that_makes_labels_makes_none(smoke_cell, scenes, tmp_path):
+    run = run_of(replace(smoke_cell, tasks=("depth",)), tmp_path / "depth")
+    output = call("--checkpoint", run, "--data", scenes, "--out", tmp_path / "out", code=2)
+    assert "has no task that makes labels" in output.replace("\n", " ")
     assert not (tmp_path / "out").exists()

@@ -11,9 +11,10 @@ import pytest
 from fake_rows import BASELINE, GRID, curve, grid_rows, make_row, write_runs
 from matplotlib.text import Text
 
+from mtl_bench.core import style
 from mtl_bench.core.columns import FPS
 from mtl_bench.evaluate.delta import delta_flat, delta_task
-from mtl_bench.report import curves, delta, plots, protocol, style
+from mtl_bench.report import curves, delta, plots, protocol
 from mtl_bench.report import grid as report
 from mtl_bench.report import table as formats
 from mtl_bench.report.columns import column

@@ -12,7 +12,8 @@ import fake_rows
 import numpy as np
 import pytest
 
-from mtl_bench.report import latency, latency_plots, plots, readme, style
+from mtl_bench.core import style
+from mtl_bench.report import latency, latency_plots, plots, readme
 from mtl_bench.report import table as formats
 from mtl_bench.report.latency import notes, tabulate, without_numbers
 

@@ -14,9 +14,43 @@ from mtl_bench.bench import store
 from mtl_bench.bench.jobs import CELLS
 from mtl_bench.core import config, plugins, quality
 from mtl_bench.core.columns import Column
-from mtl_bench.report import delta, facts, grid, latency, readme
-from mtl_bench.report.facts import Picture
+from mtl_bench.report import delta, grid, latency, readme
 
+NORMALS = """
+from dataclasses import dataclass
+
+import numpy as np
+
+from mtl_bench.core.columns import Column
+from mtl_bench.core.task import Task
+from mtl_bench.core.view import View
+
+
+@dataclass(frozen=True)
+class Angles(View):
+    normals_HW3: np.ndarray
+
+    def picture(self, image_HW3):
+        return np.uint8(self.normals_HW3 * 127 + 128)
+
+
+class Normals(Task):
+    after = ("panoptic",)
+    columns = (
+        Column(
+            *("mean_angle", "normals.mean_angle", "mean angle", -1, 1, "deg"),
+            in_delta=True,
+            headline=True,
+            words="angular error",
+        ),
+    )
+    drawn = {"normals": "normals"}
+    words = {"trivial": "mean normal"}
+
+    @classmethod
+    def drawn_view(cls, name, map_HW, labels):
+        return Angles(map_HW)
+"""
 ANGLE = Column(
     *("mean_angle", "normals.mean_angle", "mean angle", -1, 1, "deg"),
     task="normals",
@@ -29,12 +63,12 @@ OWN |= {"normals.class.road.mean_angle": 12.0, "normals.class.hut.mean_angle": 3
 
 
 @pytest.fixture(autouse=True)
-def third_task(monkeypatch):
-    """The task's column and picture, as it would declare them."""
-    angles = Picture("normals", "normals", lambda image, normals: np.uint8(normals * 127 + 128))
-    known = quality.quality()
-    monkeypatch.setattr(quality, "quality", lambda: (*known, ANGLE))
-    monkeypatch.setattr(facts, "PICTURES", (*facts.PICTURES, angles))
+def third_task(monkeypatch, tmp_path_factory):
+    """The task in a user's folder, with what reports need."""
+    file = tmp_path_factory.mktemp("plugins") / "tasks" / "normals.py"
+    file.parent.mkdir()
+    file.write_text(NORMALS)
+    monkeypatch.setenv(plugins.VARIABLE, str(file.parent.parent))
 
 
 def rows():
@@ -94,6 +128,13 @@ def test_every_plot_is_drawn(built):
     assert "without value) and normals." in page
 
 
+def test_a_trivial_predictor_says_what_it_is():
+    assert grid._trivial().startswith(
+        "Trivial predictor: the training split's mean depth image and mean normal and most "
+        "frequent class per pixel."
+    )
+
+
 def test_it_counts_in_the_delta():
     (row, *_) = rows()
     assert row["metric"]["delta.flat"] == pytest.approx(-50 / 6)  # of six metrics one is better
@@ -139,7 +180,7 @@ NAMES = re.compile(r"panoptic|depth|semantic|cityscapes|kitti|synthetic|rmse|\bp
 
 @pytest.mark.parametrize(
     "path",
-    [p for p in (plugins.PACKAGE / "report").iterdir() if p.is_file() and p.stem != "facts"],
+    [p for p in (plugins.PACKAGE / "report").iterdir() if p.is_file()],
     ids=lambda path: path.name,
 )
 def test_no_module_names_a_task(path):
@@ -147,5 +188,6 @@ def test_no_module_names_a_task(path):
         assert NAMES.findall(path.read_text(encoding="utf-8")) == []
 
 
-def test_facts_name_tasks_that_exist():
+def test_columns_are_of_tasks_that_exist():
     assert {column.task for column in quality.quality()} - {"normals"} == set(config.Recipe.tasks)
+    assert {column.task for column in quality.agreement()} == set(config.Recipe.tasks)

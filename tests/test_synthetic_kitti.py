@@ -7,12 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from mtl_bench.data.layouts import KITTI, layout_of
 from test_synthetic import digests, read, warp_error
 
 from mtl_bench.core.config import Cell, Data, load_recipe
-from mtl_bench.data import kitti_files, scenes as synthetic, velodyne
+from mtl_bench.data import kitti_files, velodyne
+from mtl_bench.data import scenes as synthetic
 from mtl_bench.data.labels import CITYSCAPES19
-from mtl_bench.data.layouts import KITTI, layout_of
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.data.scenes import kitti as kitti_layout
 from mtl_bench.data.scenes import render

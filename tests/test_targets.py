@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from mtl_bench.core import config
-from mtl_bench.core.labels import IGNORE
+from mtl_bench.core.labels import IGNORE, OUTSIDE, class_of_instance_id
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
-from mtl_bench.core.labels import OUTSIDE, class_of_instance_id
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 LOSS = config.Loss()

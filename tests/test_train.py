@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 import torch
-
 from mtl_bench.bench.results import write_json
+
 from mtl_bench.core.config import Optim, to_dict
 from mtl_bench.core.device import Engine, choose_device, seed_for
-from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import train_batches
 from mtl_bench.train import checkpoint
 from mtl_bench.train.curve import data_share
@@ -30,7 +29,7 @@ def run(cell, root: Path, run_dir: Path, progress=None, **options):
     run_dir.mkdir(exist_ok=True)
     progress = progress or Progress(run_dir, lambda line: None)
     tracker = Tracker("off", cell, run_dir)
-    return train(cell, CITYSCAPES20, root, run_dir, Engine(CPU), progress, tracker, **options)
+    return train(cell, root, run_dir, Engine(CPU), progress, tracker, **options)
 
 
 def curve(run_dir: Path) -> list[dict[str, str]]:
@@ -67,7 +66,6 @@ import json, os, signal, sys
 from pathlib import Path
 import torch
 from mtl_bench.core.config import Cell, from_dict
-from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.core.device import Engine
 from mtl_bench.train.progress import Progress
 from mtl_bench.train.tracking import Tracker
@@ -80,7 +78,7 @@ class Dies(Progress):
 
 run_dir, root = Path(sys.argv[1]), Path(sys.argv[2])
 cell = from_dict(Cell, json.loads((run_dir / "cell.json").read_text()))
-train(cell, CITYSCAPES20, root, run_dir, Engine(torch.device("cpu")), Dies(run_dir, print),
+train(cell, root, run_dir, Engine(torch.device("cpu")), Dies(run_dir, print),
       Tracker("off", cell, run_dir))
 """
 
@@ -206,7 +204,7 @@ def test_nan_stops_with_the_terms_name(smoke_cell, smoke_root, tmp_path, with_op
 
 def test_learning_rates_of_the_three_groups(smoke_cell, with_optim):
     cell = with_optim(smoke_cell, lr=1e-4, head_lr_factor=10.0, method_lr=3e-4, weight_decay=0.1)
-    model, method, optimizer = build(cell, CITYSCAPES20, Engine(CPU))
+    model, method, optimizer = build(cell, Engine(CPU))
     by_parameter = {id(p): group for group in optimizer.param_groups for p in group["params"]}
     heads = {id(p) for p in model.head_parameters()}
     for parameter in model.parameters():
@@ -259,7 +257,7 @@ def test_bfloat16_trains(smoke_cell, smoke_root, tmp_path):
     engine = Engine(CPU, "bf16")
     progress = Progress(run_dir, print)
     tracker = Tracker("off", smoke_cell, run_dir)
-    train(smoke_cell, CITYSCAPES20, smoke_root, run_dir, engine, progress, tracker)
+    train(smoke_cell, smoke_root, run_dir, engine, progress, tracker)
     assert all(t.isfinite().all() for t in states(run_dir).values() if t.is_floating_point())
 
 
@@ -343,4 +341,4 @@ def test_without_labels_depth_is_masked_automatically(smoke_cell, smoke_root, tm
 
 def test_two_loss_methods_do_not_compose(smoke_cell):
     with pytest.raises(ValueError, match="is not a loss-value method"):
-        build(replace(smoke_cell, method="fixed+uncertainty"), CITYSCAPES20, Engine(CPU))
+        build(replace(smoke_cell, method="fixed+uncertainty"), Engine(CPU))

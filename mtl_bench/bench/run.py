@@ -61,7 +61,7 @@ def run_cell(
 
     Raises:
         ValueError: a parent of the cell has no result or no checkpoint, or the data set lacks what
-            its evaluation needs.
+            its evaluation or the video stage needs.
     """
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
     progress = Progress(run_dir, echo)
@@ -72,6 +72,11 @@ def run_cell(
 
     tasks = tasks_of_cell(cell)
     open_walks(cell.recipe, tasks, root)  # what would stop the evaluation is told at once
+    if cell.video and not dataset_of(cell.recipe).takes_further_labels:
+        raise ValueError(
+            f"video trains on labels of further frames, and {cell.recipe.data.dataset} takes no "
+            f"further labels; set video=false"
+        )
     if cell.single_task:
         trained = _trained_apart(cell, run_dir, engine)
     else:

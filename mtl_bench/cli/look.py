@@ -135,7 +135,8 @@ def check(
     plugins: o.PluginsOption = None,
 ) -> None:
     """Run the tests that every plug-in has to pass; exit code 1 if one fails."""
-    from mtl_bench.core.plugins import KINDS, add_folder, did_you_mean, files, kinds_of
+    from mtl_bench.core.plain import did_you_mean
+    from mtl_bench.core.plugins import KINDS, add_folder, files, kinds_of
 
     chosen = []
     for word in names:

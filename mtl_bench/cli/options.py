@@ -159,7 +159,7 @@ def bar(title: str, quiet: bool, *more: str) -> "Progress":
     )
 
     middle: list[ProgressColumn] = [BarColumn(), MofNCompleteColumn(), *map(TextColumn, more)]
-    columns = (title, *middle, TimeRemainingColumn())
+    columns: list[str | ProgressColumn] = [title, *middle, TimeRemainingColumn()]
     return Progress(*columns, console=Console(stderr=True), disable=quiet)
 
 

@@ -152,16 +152,18 @@ def _kinds(what: str | None, video: bool, tasks: tuple[str, ...]) -> list[str]:
     Raises:
         ValueError: an unknown kind, or one of a task that the cell lacks.
     """
-    from mtl_bench.show.predict.files import NEEDS
+    from mtl_bench.core.quality import declared, in_turns
 
+    pairs = in_turns([(k, task) for k in kinds] for task, kinds in declared("files").items())
+    task_of = dict(pairs)
     if what is None:
-        return [] if video else [kind for kind, task in NEEDS.items() if task in tasks]
+        return [] if video else [kind for kind, task in task_of.items() if task in tasks]
     kinds = [word.strip() for word in what.split(",") if word.strip()]
     for kind in kinds:
-        if kind not in NEEDS:
-            raise ValueError(f"--what '{kind}' is none of {', '.join(NEEDS)}")
-        if NEEDS[kind] not in tasks:
-            raise ValueError(f"--what {kind} takes the task {NEEDS[kind]}, which the cell lacks")
+        if kind not in task_of:
+            raise ValueError(f"--what '{kind}' is none of {', '.join(task_of)}")
+        if task_of[kind] not in tasks:
+            raise ValueError(f"--what {kind} takes the task {task_of[kind]}, which the cell lacks")
     return kinds
 
 

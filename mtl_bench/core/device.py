@@ -52,7 +52,8 @@ class Engine:
 
     def place(self, model: nn.Module) -> nn.Module:
         layout = torch.channels_last if self.channels_last else torch.contiguous_format
-        return model.to(self.device, memory_format=layout)  # type: ignore[call-overload]
+        found: nn.Module = model.to(self.device, memory_format=layout)  # type: ignore[call-overload]
+        return found
 
     def autocast(self) -> AbstractContextManager[object]:
         if self.precision == "fp32":

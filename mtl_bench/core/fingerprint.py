@@ -34,6 +34,7 @@ EXCLUDED = {
     *(
         "core.fingerprint",
         "core.columns",
+        "core.quality",
         "core.files",
         "core.locks",
         "train.progress",

@@ -1,11 +1,11 @@
-"""The pinhole camera: pixels to points and back, warping one frame into another, surface normals.
+"""The pinhole camera: pixels to points and back, warping one frame into another.
 
 Shapes: B samples, H x W pixels. Pixel centres are integers, the top-left one is (0, 0). Camera
 axes: x right, y down, z forward; intrinsics K without skew. Metres, or any other unit that depth
 and translation share. Everything works in the precision of what it is given, on its device.
 
-kornia's `warp_frame_depth` gives the same image in two to three times the time, but no mask; its
-normals come from Sobel filters. It serves the tests as the oracle.
+kornia's `warp_frame_depth` gives the same image in two to three times the time, but no mask. It
+serves the tests as the oracle.
 """
 
 import torch
@@ -58,16 +58,6 @@ def back_project(depth_B1HW: Tensor, K_B33: Tensor) -> Tensor:
     return torch.cat([(x_1W - cx) / fx * z_B1HW, (y_H1 - cy) / fy * z_B1HW, z_B1HW], 1)
 
 
-def project(points_B3HW: Tensor, K_B33: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels [B,H,W,2] as (x, y), and where they are in view [B,1,H,W], of points.
-
-    In view: in front of the camera and inside an image of the points' own height and width.
-    """
-    scaled_B3HW = (K_B33 @ points_B3HW.flatten(2)).view_as(points_B3HW)
-    offset_B2HW, half_211, in_view_B1HW = _divide(scaled_B3HW)
-    return (offset_B2HW + half_211).permute(0, 2, 3, 1), in_view_B1HW
-
-
 def warp(
     image_B3HW: Tensor,
     depth_B1HW: Tensor,
@@ -98,29 +88,6 @@ def warp(
     grid_BHW2 = (offset_B2HW / half_211).clamp(-4, 4).permute(0, 2, 3, 1)
     warped = F.grid_sample(image_B3HW, grid_BHW2, padding_mode=padding, align_corners=True)
     return warped, valid_B1HW
-
-
-def normals(points_B3HW: Tensor) -> Tensor:
-    """Unit surface normals [B,3,H,W], pointing away from the camera: +y on the ground.
-
-    Mean of the unit cross products of four pairs of neighbours, each a right angle apart; border
-    pixels take their inner neighbour's. All four turn the same way, unlike in MGNet's public code,
-    where one does not and cancels another.
-    """
-
-    def toward(down: int, right: int) -> Tensor:
-        height, width = points_B3HW.shape[-2:]
-        neighbor = points_B3HW[..., 1 + down : height - 1 + down, 1 + right : width - 1 + right]
-        return neighbor - points_B3HW[..., 1:-1, 1:-1]
-
-    pairs = (
-        (toward(0, -1), toward(-1, 0)),  # left, up
-        (toward(0, 1), toward(1, 0)),  # right, down
-        (toward(1, -1), toward(-1, -1)),  # down left, up left
-        (toward(-1, 1), toward(1, 1)),  # up right, down right
-    )
-    units = [F.normalize(torch.linalg.cross(a, b, dim=1), dim=1) for a, b in pairs]
-    return F.pad(F.normalize(torch.stack(units).sum(0), dim=1), (1, 1, 1, 1), mode="replicate")
 
 
 def _pixels(like_B1HW: Tensor) -> Tensor:

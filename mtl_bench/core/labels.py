@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+NUMBERING = "Cityscapes"  # whose label and instance ids these are
 IGNORE = 255  # class index of a pixel that has no label
 DIVISOR = 1000  # instance id = label id * 1000 + number; below it: a plain label id
 OUTSIDE = -1  # instance id of padding

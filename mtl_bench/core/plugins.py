@@ -159,7 +159,8 @@ def _derives(path: Path, kind: str) -> bool:
     """Whether a file of this package defines a class that descends from a kind's contract."""
     module, base = BASES[kind]
     contract = of_package(module.removeprefix("mtl_bench.")), base
-    return any(contract in ancestry(path, name) for name in load_text(path).statements)
+    public = (name for name in load_text(path).statements if not name.startswith("_"))
+    return any(contract in ancestry(path, name) for name in public)
 
 
 @functools.cache
@@ -227,6 +228,16 @@ def _attributes(text: bytes) -> Mapping[str, Any]:
     for name, value in _assigned(text):
         with contextlib.suppress(ValueError):  # not a literal
             found[name] = ast.literal_eval(value)
+    return found
+
+
+def readable(kind: str) -> list[str]:
+    """Names whose attributes can be read: of one file, which is Python."""
+    found = []
+    for name, paths in _candidates(kind).items():
+        with contextlib.suppress(SyntaxError, ValueError):  # ValueError: null bytes
+            _parse(paths[0].read_bytes())
+            found += [name] * (len(paths) == 1)
     return found
 
 

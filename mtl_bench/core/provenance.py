@@ -37,22 +37,26 @@ def code(cell: Cell) -> Code:
     Raises:
         ValueError: a plug-in that is not there, or is no Python.
     """
+    found = {stage: fingerprints(stage, begins) for stage, begins in roots(cell).items()}
+    labels = {f"labels by {part}": code for part, code in found.pop("label", {}).items()}
+    found["train"] = found["train"] | labels  # a new one: fingerprints are kept and shared
+    return found
+
+
+def roots(cell: Cell) -> dict[str, list[Root]]:
+    """Where the code of each stage begins; a video cell has the stage "label", too."""
     tasks = [plugin_root("tasks", name) for name in cell.tasks]
     dataset = plugin_root("datasets", cell.recipe.data.dataset.replace("-", "_"))
-    seen = [*tasks, dataset, backbone_root(cell.backbone)]
     methods = [
         Root(plugins.path_of("methods", name), part="method", base="Method")
         for name in plugins.part_names(cell.method)
     ]
+    seen = [*tasks, dataset, backbone_root(cell.backbone)]
     found = {
-        stage: fingerprints(stage, [*(methods if stage == "train" else ()), *seen, *roots])
-        for stage, roots in HARNESS_ROOTS.items()
+        stage: [*(methods if stage == "train" else ()), *seen, *begins]
+        for stage, begins in HARNESS_ROOTS.items()
     }
-    if cell.video:
-        labels = fingerprints("label", [*tasks, dataset])
-        made = {f"labels by {part}": code for part, code in labels.items()}
-        found["train"] = found["train"] | made
-    return found
+    return found | ({"label": [*tasks, dataset]} if cell.video else {})
 
 
 def backbone_root(name: str) -> Root:

@@ -1,52 +1,84 @@
-"""The columns of what tasks measure, in the order in which a table has them.
+"""What tasks declare of themselves: the columns of what they measure, and words for reports.
 
-They are read from the tasks' files as text, so that a list of results need not wait for torch.
+It is read from the tasks' files as text, so that a list of results need not wait for torch.
 """
 
 import ast
 import functools
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 from mtl_bench.core import plugins
 from mtl_bench.core.columns import Column
 
-ALLOWED = (
-    *(ast.Call, ast.Name, ast.Starred, ast.Tuple, ast.keyword, ast.Constant, ast.UnaryOp),
-    *(ast.UAdd, ast.USub, ast.Load),
-)
+VALUES = ast.Call | ast.Name | ast.Starred | ast.Tuple | ast.Dict | ast.keyword | ast.Constant
+SIGNS = ast.UnaryOp | ast.UAdd | ast.USub | ast.Load
+T = TypeVar("T")
 
 
-def quality() -> tuple[Column, ...]:
-    """Of every task that is found, each behind those whose results it reads."""
-    found: dict[str, Column] = {}
-    for name in plugins.ordered(plugins.files("tasks")):
-        for column in columns_of(name):
-            found.setdefault(column.name, column)  # a task's heir has its columns, too
-    return tuple(found.values())
+def declared(name: str) -> dict[str, Any]:
+    """By task, what its class assigns to a name; every task is behind those it comes `after`.
 
-
-def columns_of(task: str) -> tuple[Column, ...]:
-    """A task's columns; an heir's come after those of the task that it derives from.
-
-    Raises:
-        ValueError: anything but columns of plain values.
+    Tasks that assign nothing are absent.
     """
-    text = plugins.path_of("tasks", task).read_bytes()
-    inherited = [column for base in plugins.bases("tasks", text) for column in columns_of(base)]
-    return (*inherited, *_columns(task, text))
+    tasks = plugins.ordered(plugins.readable("tasks"))
+    found = {task: _read(task, plugins.path_of("tasks", task).read_bytes(), name) for task in tasks}
+    return {task: value for task, value in found.items() if value is not None}
 
 
 @functools.cache
-def _columns(task: str, text: bytes) -> tuple[Column, ...]:
-    """What a file's `columns = (Column(...), ...)` says."""
-    for node in plugins.class_attributes(text, "columns"):
+def _read(task: str, text: bytes, name: str) -> Any:
+    """What a file's class says: plain values and `Column(...)` of such; None where it does not.
+
+    Raises:
+        ValueError: anything else.
+    """
+    for node in plugins.class_attributes(text, name):
         for part in ast.walk(node):
-            known = isinstance(part, ALLOWED)
+            known = isinstance(part, VALUES | SIGNS)
             if not known or (isinstance(part, ast.Name) and part.id != "Column"):
-                raise ValueError(f"task '{task}': columns are a tuple of Column(...) of values")
-        made = eval(compile(ast.Expression(node), task, "eval"), {"Column": Column})
-        return tuple(replace(column, task=task) for column in made)
-    return ()
+                raise ValueError(f"task '{task}': {name} are plain values and Column(...) of them")
+        return eval(compile(ast.Expression(node), task, "eval"), {"Column": Column})
+    return None
+
+
+def quality() -> tuple[Column, ...]:
+    """The columns of what tasks measure, in the order in which a table has them."""
+    return tuple(_columns("columns"))
+
+
+def agreement() -> tuple[Column, ...]:
+    """The columns of how near an engine's results are."""
+    columns = _columns("agreement")
+    tasks = dict.fromkeys(column.task for column in columns)
+    return tuple(in_turns([c for c in columns if c.task == task] for task in tasks))
+
+
+def words(key: str) -> list[str]:
+    """What the tasks' `words` say under a key."""
+    return [said[key] for said in declared("words").values() if key in said]
+
+
+def in_turns(several: Iterable[Sequence[T]]) -> list[T]:
+    """The first of each, then the second of each, and so on."""
+    turns = itertools.zip_longest(*several)
+    return [item for turn in turns for item in turn if item is not None]
+
+
+def columns_of(task: str, name: str = "columns") -> list[Column]:
+    """A task's columns; an heir's come after those of the task that it derives from."""
+    text = plugins.path_of("tasks", task).read_bytes()
+    inherited = [c for base in plugins.bases("tasks", text) for c in columns_of(base, name)]
+    return [*inherited, *(replace(c, task=task) for c in _read(task, text, name) or ())]
+
+
+def _columns(name: str) -> list[Column]:
+    """Of every task that is found; an heir's own alone, as its task's are there."""
+    tasks = plugins.ordered(plugins.readable("tasks"))
+    found = {c.name: c for task in tasks for c in columns_of(task, name)}
+    return list(found.values())
 
 
 def in_brief() -> list[Column]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ from mtl_bench.core.dataset import Dataset, LabelFrames, dataset_of
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.terms import Term
+from mtl_bench.core.view import View
 
 Maps = dict[str, Tensor]  # by name, [B,C,H,W]
 Results = dict[str, Tensor]  # by name, the first axis is B
@@ -141,6 +141,17 @@ class Task:
     reads_camera: ClassVar[bool] = False  # whether `finish` or `points` does
     makes_labels: ClassVar[bool] = False  # whether the video stage's labels come from it
     averages_flip: ClassVar[bool] = False  # whether `flip_averaged` does anything
+    # The kinds of files that `predict` can write of a frame, the picture first; "points" is the
+    # cloud that is made of a Surface
+    files: ClassVar[tuple[str, ...]] = ()
+    # Maps that `Metric.update` gives and reports draw beside "true_<name>": the captions' words
+    drawn: ClassVar[Mapping[str, str]] = {}
+    agreement: ClassVar[tuple[Column, ...]] = ()  # of how near an engine's results are
+    counts: ClassVar[Mapping[str, str]] = {}  # keys of a row that count frames: what they are
+    # What reports say of it: "trivial", the trivial predictor's result, and a sentence on it in
+    # "trivial_note"; "timed", what stands at the end of what is timed; "random", what random
+    # weights change of that; "counted", what the frames of `counts` are
+    words: ClassVar[Mapping[str, str]] = {}
     # Which of a task's members make the numbers of each stage; the others make none
     stage_members: ClassVar[dict[str, tuple[str, ...]]] = {
         "train": (
@@ -175,12 +186,19 @@ class Task:
             "training_protocol",
             "protocol",
             "trivial",
-            "pictures",
             "write_results",
             "exported",
             "reads_camera",
             "has_points",
             "like_trained",
+            "at_size",
+            "view",
+            "files",
+            "drawn",
+            "drawn_view",
+            "agreement",
+            "counts",
+            "words",
         ),
     }
 
@@ -304,9 +322,27 @@ class Task:
         """The trivial predictor for frames of this size, where there is one."""
         return None
 
-    def pictures(self, image_HW3: NDArray[np.uint8], frame: Frame) -> dict[str, NDArray[np.uint8]]:
-        """A heading -> RGB picture [H,W,3] of what `Metric.update` said of a frame."""
-        return {}
+    # --- for a viewer -----------------------------------------------------------------------------
+
+    def at_size(self, size: Size) -> "Task":
+        """This task, with the lengths and areas of its post-processing made for another size.
+
+        In the recipe they are pixels of the recipe's size.
+        """
+        return self
+
+    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> View | None:
+        """What a viewer sees of the results of a batch of one, where there is something to see.
+
+        Args:
+            camera_height_m: None where it is not known: `finish` was told 1.
+        """
+        return None
+
+    @classmethod
+    def drawn_view(cls, name: str, map_HW: NDArray[Any], labels: LabelSet) -> View:
+        """The view of a map of `drawn`, or of its truth."""
+        raise NotImplementedError
 
 
 def tasks_of(recipe: Recipe, names: Iterable[str], labels: LabelSet) -> tuple[Task, ...]:

@@ -250,7 +250,8 @@ def jitter(frames_N3HW: Tensor, settings: config.Augment, generator: Generator) 
         _apply([adjust, *changes[at + 1 :]], jittered, jittered)
     else:
         _apply(changes, picture, jittered)
-    return jittered.unflatten(1, (len(frames_N3HW), -1)).transpose(0, 1)
+    found: Tensor = jittered.unflatten(1, (len(frames_N3HW), -1)).transpose(0, 1)
+    return found
 
 
 def _apply(changes: Sequence[Change], source_3HW: Tensor, target_3HW: Tensor) -> None:
@@ -265,7 +266,10 @@ def _blocks(picture_3HW: Tensor) -> tuple[Tensor, ...]:
     """Bands of rows. Several threads get the whole picture, which they share out by themselves: in
     every block they would wait for one another, for seconds where the machine is busy."""
     height, width = picture_3HW.shape[1:]
-    return picture_3HW.split(height if torch.get_num_threads() > 1 else max(_BLOCK // width, 1), 1)
+    found: tuple[Tensor, ...] = picture_3HW.split(
+        height if torch.get_num_threads() > 1 else max(_BLOCK // width, 1), 1
+    )
+    return found
 
 
 def _mean_gray(picture_3HW: Tensor) -> Tensor:
@@ -293,7 +297,8 @@ def _hue_map(factor: float) -> Tensor:
     turn = torch.eye(3)
     turn[1, 1] = turn[2, 2] = angle.cos()
     turn[1, 2], turn[2, 1] = angle.sin(), -angle.sin()
-    return torch.linalg.solve(_YIQ, turn @ _YIQ)
+    found: Tensor = torch.linalg.solve(_YIQ, turn @ _YIQ)
+    return found
 
 
 _CHANGES: tuple[Callable[..., Tensor], ...] = (

@@ -6,7 +6,7 @@ reading, or once where `mtl-bench data cache` wrote them down.
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -171,7 +171,7 @@ class Cityscapes(Dataset):
             static=ids_HW if self.training else None,
         )
 
-    def _to_input(self, array: NDArray, path: Path, interpolation: int) -> NDArray:
+    def _to_input(self, array: NDArray[Any], path: Path, interpolation: int) -> NDArray[Any]:
         height, width = self.data.height, self.data.width
         if array.shape[0] < height or array.shape[1] < width:
             raise ValueError(
@@ -180,7 +180,8 @@ class Cityscapes(Dataset):
             )
         if array.shape[:2] == (height, width):
             return array
-        return cv2.resize(array, (width, height), interpolation=interpolation)
+        found: NDArray[Any] = cv2.resize(array, (width, height), interpolation=interpolation)
+        return found
 
     # --- which files ------------------------------------------------------------------------------
 

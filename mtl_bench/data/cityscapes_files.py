@@ -229,7 +229,9 @@ def read_depth_m(path: Path, camera: Camera) -> NDArray[np.float32]:
     return depth_m
 
 
-def check_same_size(path: Path, size: tuple[int, ...], image_path: Path, expected: tuple) -> None:
+def check_same_size(
+    path: Path, size: tuple[int, ...], image_path: Path, expected: tuple[int, ...]
+) -> None:
     """Raises: ValueError where a file's height and width are not those of its image."""
     if tuple(size[:2]) != tuple(expected[:2]):
         raise ValueError(

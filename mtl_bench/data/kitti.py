@@ -279,7 +279,10 @@ class Kitti(Dataset):
             return None
         label_path = self._label_files[frame.name]
         if self.training:
-            return self.on_disk.read(label_path, frame_cache.LABELS, (path, size)).pixels
+            found: NDArray[np.uint16] | None = self.on_disk.read(
+                label_path, frame_cache.LABELS, (path, size)
+            ).pixels
+            return found
         ids = read_instance_ids(label_path)
         check_same_size(label_path, ids.shape, path, size)
         return ids
@@ -295,7 +298,7 @@ class Kitti(Dataset):
         check_same_size(depth_path, depth_m.shape, path, camera.size)
         return depth_m
 
-    def _to_input(self, array: NDArray, path: Path, interpolation: int) -> NDArray:
+    def _to_input(self, array: NDArray[Any], path: Path, interpolation: int) -> NDArray[Any]:
         return to_size(array, self.data.height, self.data.width, interpolation)
 
 

@@ -7,6 +7,7 @@ A run that starts at any step, in one process or several, therefore sees the sam
 import hashlib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import torch
@@ -110,7 +111,7 @@ def _from_workers(samples: Samples, steps: "_Steps", workers: int, pinned: bool)
         yield Batch.from_tensors(*fields)
 
 
-class _Batches(torch.utils.data.Dataset):
+class _Batches(torch.utils.data.Dataset[Any]):
     def __init__(self, samples: Samples) -> None:
         self.samples = samples
 

@@ -45,7 +45,8 @@ def read(path: Path, bits: int, color: bool = False) -> NDArray[Any]:
         raise ValueError(f"{path}: damaged PNG; copy or unpack the file again")
     if image.ndim != 2 + color:
         raise ValueError(f"{path}: {image.shape[2]} channels where one is expected")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if color else image
+    found: NDArray[Any] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if color else image
+    return found
 
 
 def read_header(path: Path) -> Header:
@@ -79,10 +80,11 @@ def _parse(path: Path, start: bytes, end: bytes) -> Header:
     return Header(height, width, start[24])
 
 
-def to_size(array: NDArray, height: int, width: int, interpolation: int) -> NDArray:
+def to_size(array: NDArray[Any], height: int, width: int, interpolation: int) -> NDArray[Any]:
     """[height,width,...]; area means, where they are asked for, turn bilinear when they enlarge."""
     if array.shape[:2] == (height, width):
         return array
     if interpolation == cv2.INTER_AREA and (height > array.shape[0] or width > array.shape[1]):
         interpolation = cv2.INTER_LINEAR
-    return cv2.resize(array, (width, height), interpolation=interpolation)
+    found: NDArray[Any] = cv2.resize(array, (width, height), interpolation=interpolation)
+    return found

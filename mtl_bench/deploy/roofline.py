@@ -95,7 +95,7 @@ class Observer(TorchDispatchMode):
     """
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.traffic = self.live_bytes = self.peak_bytes = 0
         self._parameters: dict[int, nn.Parameter] = {}
         self._storages: set[int] = set()

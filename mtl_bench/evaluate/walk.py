@@ -310,7 +310,7 @@ def _stacked(pictures: list[Picture]) -> dict[str, Any]:
     }
 
 
-def _of_one_size(pictures: list[NDArray]) -> list[NDArray]:
+def _of_one_size(pictures: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """All at the first one's size: frames may differ by some pixels, a report's must not."""
     height, width = pictures[0].shape[:2]
     rows, columns = np.arange(height)[:, None], np.arange(width)

@@ -37,7 +37,8 @@ class GlobalContext(nn.Module):
         self.conv = ConvNorm(inputs, outputs, 1)
 
     def forward(self, deepest_BCHW: Tensor) -> Tensor:
-        return self.conv(deepest_BCHW.mean((2, 3), keepdim=True))
+        found: Tensor = self.conv(deepest_BCHW.mean((2, 3), keepdim=True))
+        return found
 
 
 class AttentionRefinement(nn.Module):
@@ -50,7 +51,8 @@ class AttentionRefinement(nn.Module):
 
     def forward(self, x_BCHW: Tensor) -> Tensor:
         features = self.conv(x_BCHW)
-        return features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        found: Tensor = features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        return found
 
 
 class FeatureFusion(nn.Module):
@@ -67,7 +69,10 @@ class FeatureFusion(nn.Module):
 
     def forward(self, skip_BCHW: Tensor, deep_BCHW: Tensor) -> Tensor:
         features = self.conv(torch.cat([skip_BCHW, deep_BCHW], 1))
-        return features + features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        found: Tensor = (
+            features + features * self.gate(features.mean((2, 3), keepdim=True)).sigmoid()
+        )
+        return found
 
 
 class Decoder(nn.Module):

@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from mtl_bench.core.style import MANY, Look, save, styled
 from mtl_bench.report.columns import capital
 from mtl_bench.report.plots import heat_table, looks_of, watermark
-from mtl_bench.report.style import MANY, Look, save, styled
 from mtl_bench.report.table import NOTHING
 
 if TYPE_CHECKING:

@@ -16,8 +16,9 @@ from mtl_bench.core import quality
 from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
+from mtl_bench.core.style import MANY
 from mtl_bench.report import columns as known
-from mtl_bench.report import curves, facts, pictures, plots, protocol
+from mtl_bench.report import curves, pictures, plots, protocol
 from mtl_bench.report.columns import DELTA, ONLY, RELATIVE, Row, headlines, pairs, per_class, text
 from mtl_bench.report.delta import counted
 from mtl_bench.report.page import Page, figures_of, forget, render
@@ -31,7 +32,6 @@ from mtl_bench.report.statistics import (
     kept,
     trivial_group,
 )
-from mtl_bench.report.style import MANY
 from mtl_bench.report.table import (
     ARROWS,
     NOTHING,
@@ -325,7 +325,7 @@ def footnotes(results: Results) -> Iterator[str]:
     if results.reference is not None:
         yield from _relative(results, results.reference)
     if results.baseline:
-        yield facts.TRIVIAL
+        yield _trivial()
     stale = [row for group in groups if group.status == "stale" for row in group.rows]
     if stale:
         why = ", ".join(dict.fromkeys(str(row["error"]) for row in stale if row.get("error")))
@@ -473,17 +473,25 @@ def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, 
     return captions
 
 
+def _trivial() -> str:
+    made = " and ".join(sorted(quality.words("trivial")))
+    note = f"Trivial predictor: the training split's {made}. It looks at no image; a network has to"
+    return " ".join([f"{note} beat it.", *quality.words("trivial_note")])
+
+
 def counted_images(results: Results) -> Section | None:
     """What the evaluation counted, summed over a group's seeds."""
+    counts = {k: v for said in quality.declared("counts").values() for k, v in said.items()}
     lines = []
     for group in results.groups:
-        values = [[row.get("metric", {}).get(key) for row in group.rows] for key in facts.COUNTS]
+        values = [[row.get("metric", {}).get(key) for row in group.rows] for key in counts]
         found = [[value for value in several if value is not None] for several in values]
         if any(found):
             sums = [Cell(f"{sum(several):g}" if several else NOTHING) for several in found]
             lines.append(TableRow.of(group.label, *sums))
-    heads = (*Head.words(axis_title(results.axes[0])), *map(Head, facts.COUNTS.values()))
-    return Section(facts.COUNTED, heads, tuple(lines)) if lines else None
+    heads = (*Head.words(axis_title(results.axes[0])), *map(Head, counts.values()))
+    title = f"{'; '.join(quality.words('counted'))} (all seeds together)"
+    return Section(title, heads, tuple(lines)) if lines else None
 
 
 def _states(rows: Iterable[Row]) -> str:

@@ -11,7 +11,8 @@ from typing import Any
 from markupsafe import Markup
 
 from mtl_bench.core.columns import FPS, Column
-from mtl_bench.report import facts, latency_plots, protocol
+from mtl_bench.core.quality import agreement, words
+from mtl_bench.report import latency_plots, protocol
 from mtl_bench.report.columns import Row, against, different, headlines, measured, text
 from mtl_bench.report.grid import published
 from mtl_bench.report.page import Page, figures_of, forget, render
@@ -33,7 +34,7 @@ REFERENCE = "plain"  # the engine that speed-ups are over
 WORDS = {"missing": "not run"}  # a status as a reader says it
 PASSES = 500  # the paper's
 MEAN = Column("mean_ms", "latency.mean_ms", "mean", -1, 1, "ms", short=True)
-COLUMNS = (
+TIMES = (
     MEAN,
     Column("p50_ms", "latency.p50_ms", "p50", -1, 1, "ms"),
     Column("p95_ms", "latency.p95_ms", "p95", -1, 1, "ms", short=True),
@@ -44,10 +45,18 @@ COLUMNS = (
     Column("network_ms", "latency.network_ms", "network", -1, 1, "ms", short=True),
     Column("postprocess_ms", "latency.postprocess_ms", "postproc", -1, 1, "ms", short=True),
     Column("throughput_fps", "latency.throughput_fps", "batched", +1, 2, "FPS"),
-    *facts.AGREEMENT,
+)
+MORE = (
     Column("roofline", "roofline.share", "roofline", +1, 0, "% reached", scale=100),
     Column("passes", "latency.passes", "passes", 0, 0),
 )
+
+
+def columns() -> tuple[Column, ...]:
+    """Of numbers; those of a task say how near an engine's results are."""
+    return (*TIMES, *agreement(), *MORE)
+
+
 IDENTITY = ("backbone", "tasks", "engine", "precision")  # columns of words, beside the size
 PUBLISHED = {  # columns of a published list: words, then numbers
     **{name: name for name in ("name", "backbone", "tasks", "size", "engine", "gpu")},
@@ -144,7 +153,7 @@ class Timings:
 
     def columns(self) -> list[Column]:
         """Those that some line has."""
-        return [c for c in COLUMNS if any(not math.isnan(v.values[c.name]) for v in self.lines)]
+        return [c for c in columns() if any(not math.isnan(v.values[c.name]) for v in self.lines)]
 
     def facts(self, key: str) -> list[str]:
         """Different values of a measured fact, such as `latency.device`."""
@@ -177,7 +186,7 @@ def _alike(row: Row) -> str:
 def _line(row: Row, reference: Row | None) -> Line:
     arguments = row["timing"].get("backbone_args", {})
     backbone = " ".join([row["backbone"], *(f"{k}={text(v)}" for k, v in arguments.items())])
-    values = {c.name: measured(row, c) if _tells(row, c) else math.nan for c in COLUMNS}
+    values = {c.name: measured(row, c) if _tells(row, c) else math.nan for c in columns()}
     if row["status"] in SHOWN and reference is not None:
         values["speedup"] = measured(reference, MEAN) / values[MEAN.name]
     return Line(
@@ -192,7 +201,7 @@ def _line(row: Row, reference: Row | None) -> Line:
 
 def _tells(row: Row, column: Column) -> bool:
     """Whether a row may show a number: a wrong one how wrong it is, and no time."""
-    return row["status"] in SHOWN or (row["status"] == "wrong" and column in facts.AGREEMENT)
+    return row["status"] in SHOWN or (row["status"] == "wrong" and bool(column.task))
 
 
 def _qualities(rows: Sequence[Row], tasks: set[str]) -> Iterator[Quality]:
@@ -276,7 +285,7 @@ def _records(timings: Timings) -> Iterator[dict[str, Any]]:
     for line in timings.lines:
         values: dict[str, Any] = {"kind": "measured", "status": line.status, "mark": line.mark}
         values |= dict(zip(IDENTITY, line.names, strict=True)) | {"size": line.size}
-        values |= {column.name: line.values[column.name] for column in COLUMNS}
+        values |= {column.name: line.values[column.name] for column in columns()}
         metric = line.row["metric"] if line.shown else {}
         others = {key.partition(".")[2]: value for key, value in metric.items()}
         values |= {key: value for key, value in others.items() if key not in values}
@@ -346,7 +355,7 @@ def notes(timings: Timings) -> Iterator[str]:
     threads = " or ".join(timings.facts("threads"))
     yield (
         f"Measured on {where}, {threads} thread{'s' * (threads != '1')}, batch 1: from the 8-bit "
-        f"image in host memory to {facts.RESULT}, transfer and post-processing in. "
+        f"image in host memory to {' and '.join(words('timed'))}, transfer and post-processing in. "
         "FPS is 1000 / mean; the three stages add up to the mean."
     )
     if len(timings.facts("device")) > 1:
@@ -361,11 +370,12 @@ def notes(timings: Timings) -> Iterator[str]:
         yield f"Batched: throughput in images a second, {batches} at a time."
     yield (
         f"Agreement: output compared with that of '{REFERENCE}' on the same images before anything "
-        f"is timed: {facts.COMPARED}. A line that "
+        f"is timed: {', '.join(c.in_words for c in agreement())}. A line that "
         "differs too much is marked wrong and has no time."
     )
     if any(line.row.get("weights") == "random" for line in lines):
-        yield facts.RANDOM
+        but = "".join(f", but {said}" for said in words("random"))
+        yield f"Random weights: a convolution takes as long as with trained ones{but}."
     yield from _doubts(timings)
 
 

@@ -16,9 +16,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from mtl_bench.core.columns import FPS, Column
+from mtl_bench.core.style import GRAY, MARKERS, looks, save, styled
 from mtl_bench.report.plots import better, draw_front
 from mtl_bench.report.statistics import SMOKE
-from mtl_bench.report.style import GRAY, MARKERS, looks, save, styled
 
 if TYPE_CHECKING:
     from mtl_bench.report.latency import Line, Timings

@@ -20,12 +20,10 @@ from typing import Any
 
 from markupsafe import Markup
 
-from mtl_bench.core.columns import Column
+from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.config import load_recipe, recipe_names, to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
-from mtl_bench.report import facts
 from mtl_bench.report.columns import Row, flatten, measured, text
-from mtl_bench.report.facts import Scaling
 from mtl_bench.report.page import Page, render
 from mtl_bench.report.statistics import (
     KNOWN,
@@ -61,11 +59,20 @@ TEXTS = {  # columns of words: their titles
     "protocol": "Protocol",
     "frames": "Frames",
 }
-NUMBERS = {column.name: column for column in facts.LITERATURE}
+COST = (Column("runtime_ms", "latency.mean_ms", "Runtime", -1, 1, "ms", part="cost"), FPS)
 LONG = 46  # characters of a method with its details: longer ones are broken in LaTeX
 UNNEEDED = re.compile(r"\((R|TM)\)| Processor\b| CPU\b(?= )")  # of a device's name
 FULL_FRAME = "full-frame"  # rows from before protocols had names
 SAID = {"recipe.data.dataset", "recipe.data.height", "recipe.data.width", *KNOWN} - {"granularity"}
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """One way to scale a result before it is compared with the truth."""
+
+    name: str = ""
+    place: str = ""  # of its metrics, behind a protocol's prefix
+    failed: str = ""  # where the frames are counted that it found no scale for
 
 
 @dataclass(frozen=True)
@@ -80,7 +87,7 @@ class Literature:
     built_in: tuple[str, ...]  # of cells measured on rendered scenes in its layout
     split: str
     frames: int  # of the split, as papers report it
-    columns: tuple[str, ...]  # of TEXTS and NUMBERS, in their order
+    columns: tuple[str, ...]  # of TEXTS, `number` and COST, in their order
     narrow: tuple[str, ...]  # those that fit on a page of a paper
     sort: str  # the column
     data: str = ""  # what the column of training images says of measured rows
@@ -89,11 +96,15 @@ class Literature:
     titles: Mapping[str, str] = field(default_factory=dict)  # other than in TEXTS
     notes: tuple[str, ...] = ()
     symbols: Mapping[str, str] = field(default_factory=dict)  # behind a method: what it says
+    number: tuple[Column, ...] = ()  # {scaled} in a key is a scaling's place
+    scaling: tuple[Scaling, ...] = (Scaling(),)
     row: tuple[Mapping[str, Any], ...] = ()  # columns, details, source; symbols, note, printed_as
 
     @property
-    def numbers(self) -> list[Column]:
-        return [NUMBERS[name] for name in self.columns if name in NUMBERS]
+    def numbers(self) -> dict[str, Column]:
+        """Those of `columns`, by name, in their order."""
+        known = {column.name: column for column in (*self.number, *COST)}
+        return {name: known[name] for name in self.columns if name in known}
 
 
 def names() -> list[str]:
@@ -199,7 +210,7 @@ def dataset_of(row: Row) -> Any:
 
 def _sorted(literature: Literature, lines: Sequence[Line]) -> list[Line]:
     """Best first; equals stay in their order, and what has no value comes last."""
-    better = NUMBERS[literature.sort].better
+    better = literature.numbers[literature.sort].better
 
     def rank(line: Line) -> tuple[bool, float]:
         value = line.entries.get(literature.sort, Entry()).mean
@@ -231,12 +242,13 @@ def _notes(found: Comparison, left_out: int) -> Iterator[str]:
 
 
 def _published(literature: Literature) -> list[Line]:
+    known = literature.numbers
     return [
         Line(
             kind="published",
             texts={k: str(v) for k, v in row.items() if k in TEXTS},
-            entries={k: Entry(float(v), count=1) for k, v in row.items() if k in NUMBERS},
-            printed={k: str(v) for k, v in row.items() if k in NUMBERS},
+            entries={k: Entry(float(v), count=1) for k, v in row.items() if k in known},
+            printed={k: str(v) for k, v in row.items() if k in known},
             details=row["details"],
             symbols=row.get("symbols", ""),
             source=row["source"],
@@ -261,7 +273,7 @@ def _measured(literature: Literature, rows: Sequence[Row]) -> Iterator[Line]:
         for group in grouped(own, axes):
             details = _details(group, axes, literature)
             for prefix, about in _protocols(group):
-                for scaling in facts.SCALINGS if literature.protocols else facts.SCALINGS[:1]:
+                for scaling in literature.scaling:
                     line = _line(literature, group, prefix, about, scaling)
                     if line.entries[literature.sort].count:
                         yield replace(line, details=details)
@@ -302,7 +314,7 @@ def _line(
             "protocol": f"{about['name']}, {scaling.name}",
             "frames": _text(frames) if built_in else f"{_text(frames)}/{all_frames}",
         },
-        entries={c.name: _entry(group.rows, c, scaled) for c in literature.numbers},
+        entries={c.name: _entry(group.rows, c, scaled) for c in literature.numbers.values()},
         details="",
         count=len(group.rows),
         marks=tuple(marks),
@@ -389,7 +401,7 @@ def fill(found: Comparison, narrow: bool = False) -> Table:
     heads = [*Head.words("Method", "Origin"), *heads, Head("n")]
     return Table(
         sections=tuple(
-            Section(part.heading, tuple(heads), _rows(part, shown, letters))
+            Section(part.heading, tuple(heads), _rows(literature, part, shown, letters))
             for part in found.sections
         ),
         notes=found.notes,
@@ -401,29 +413,31 @@ def fill(found: Comparison, narrow: bool = False) -> Table:
     )
 
 
-def _rows(part: Part, shown: Sequence[str], letters: Mapping[str, str]) -> tuple[TableRow, ...]:
+def _rows(
+    literature: Literature, part: Part, shown: Sequence[str], letters: Mapping[str, str]
+) -> tuple[TableRow, ...]:
     rows = []
     for line in part.lines:
-        values = [cell(line, name) for name in shown]
+        values = [cell(line, name, literature.numbers) for name in shown]
         origin = _origin(line, letters, shown)
         css = line.kind + " marked" * bool(line.marks)
         rows.append(TableRow.of(_method(line), origin, *values, line.seeds, css=css))
     return tuple(rows)
 
 
-def cell(line: Line, name: str) -> Cell:
+def cell(line: Line, name: str, known: Mapping[str, Column]) -> Cell:
     """A column's words, or its number with its spread; a published number is as printed."""
     if name in TEXTS:
         return Cell(line.texts.get(name, NOTHING))
     if line.kind == "published":
         entry = line.entries.get(name)
         return Cell(line.printed.get(name, NOTHING), value=entry.mean if entry else None)
-    return Cell.of(line.entries[name], NUMBERS[name], line.count)
+    return Cell.of(line.entries[name], known[name], line.count)
 
 
 def _head(literature: Literature, name: str) -> Head:
-    if name in NUMBERS:
-        return Head.of(NUMBERS[name])
+    if name in literature.numbers:
+        return Head.of(literature.numbers[name])
     return Head(literature.titles.get(name, TEXTS[name]), left=True, css=name)
 
 
@@ -469,7 +483,7 @@ def _records(found: Comparison, shown: Sequence[str]) -> Iterator[dict[str, Any]
                 if name in TEXTS:
                     values[name] = line.texts.get(name, "")
                 else:
-                    values |= numbers(line.entries, [NUMBERS[name]])
+                    values |= numbers(line.entries, [found.literature.numbers[name]])
             yield values | {"n": line.count, "note": line.note, "source": line.source}
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mtl_bench.report import facts
+from mtl_bench.core import plugins, quality
+from mtl_bench.core.canvas import Image
+from mtl_bench.core.labels import LabelSet
+from mtl_bench.core.style import GRAY, save, styled
 from mtl_bench.report.columns import headlines
-from mtl_bench.report.facts import Image, Picture
 from mtl_bench.report.statistics import SMOKE, kept
-from mtl_bench.report.style import GRAY, save, styled
 
 if TYPE_CHECKING:
     from mtl_bench.report.grid import Results
@@ -25,13 +26,36 @@ TILE, GAP, HEADER = 192, 4, 20  # pixels: width, between tiles, height of a line
 
 
 @dataclass(frozen=True)
+class Picture:
+    """How a map that a run keeps is drawn beside its truth."""
+
+    task: str
+    key: str  # in samples.npz; the truth is true_<key>
+
+    def draw(self, image: Image, map_HW: NDArray[Any], labels: LabelSet) -> Image:
+        """Input and map are of one size; imports the task."""
+        view = plugins.load("tasks", self.task).drawn_view(self.key, map_HW, labels)
+        drawn: Image = view.picture(image)
+        return drawn
+
+
+def pictures() -> dict[Picture, str]:
+    """Those of every task that is found, with their words in a caption."""
+    return {
+        Picture(task, key): words
+        for task, drawn in quality.declared("drawn").items()
+        for key, words in drawn.items()
+    }
+
+
+@dataclass(frozen=True)
 class Samples:
     """Some evaluation images, one run's predictions on them and the truth."""
 
     names: list[str]
     image: Image  # [n,H,W,3]
-    maps: Mapping[str, NDArray[Any]]  # Picture.key, true_<key> -> [n,H,W,...]; absent: no such task
-    quality: list[float]  # of the extremes, rising; else empty
+    maps: Mapping[str, NDArray[Any]]  # <key>, true_<key> -> [n,H,W,...]; absent: no such task
+    quality: Mapping[str, NDArray[Any]]  # of the extremes: what they were picked by, rising
 
     @staticmethod
     def load(path: Path, kind: str = "") -> "Samples | None":
@@ -41,10 +65,11 @@ class Samples:
             values = {key.removeprefix(kind): file[key] for key in keys}
         if "names" not in values:
             return None
+        picked = [column.name for column in headlines() if column.name in values]
         return Samples(
             names=[str(name) for name in values.pop("names")],
             image=values.pop("image"),
-            quality=[float(value) for value in values.pop(headlines()[0].name, ())],
+            quality={name: values.pop(name) for name in picked},
             maps=values,
         )
 
@@ -60,10 +85,10 @@ def draw(results: "Results", runs_root: Path, out_dir: Path) -> str | None:
         return None
     shown = found[:GROUPS]
     images = IMAGES if len(found) == len(shown) else IMAGES_OF_MANY
-    lines = _lines([samples for _, samples in shown], images)
+    lines = _lines([samples for _, samples in shown], images, _labels(results))
     titles = ["input", "truth", *(label for label, _ in shown)]
     _draw_lines(lines, titles, results.smoke, out_dir, "samples")
-    maps = " and ".join(picture.words for picture in facts.PICTURES)
+    maps = " and ".join(pictures().values())
     what = f"Input, ground truth and predictions on the first evaluation images: {maps}."
     return what + _left_out(found)
 
@@ -71,23 +96,25 @@ def draw(results: "Results", runs_root: Path, out_dir: Path) -> str | None:
 def extremes(results: "Results", runs_root: Path, out_dir: Path) -> str | None:
     """`extremes.png`: the worst and the best frame of every group's first seed.
 
-    They are kept by the first headline, and drawn as the first picture.
+    They were picked by a headline, and are drawn as the picture of its task.
 
     Returns:
         What the figure shows in words, or None where no run kept such frames.
     """
     found = _found(results, runs_root, "extremes.")
-    column = headlines()[0]
+    if not found:
+        return None
+    column = next(column for column in headlines() if column.name in found[0][1].quality)
+    picture = next(picture for picture in pictures() if picture.task == column.task)
+    title, labels = column.title, _labels(results)
     lines: list[list[Image | None]] = []
     headers, told = [], []
     for label, samples in found[:GROUPS]:
-        lines.append([tile for index in (0, -1) for tile in _triple(samples, index)])
-        worst, best = (f"{samples.quality[i]:.{column.digits}f}" for i in (0, -1))
-        title = column.title
+        tiles = [_triple(samples, index, picture, labels) for index in (0, -1)]
+        lines.append([tile for triple in tiles for tile in triple])
+        worst, best = (f"{samples.quality[column.name][i]:.{column.digits}f}" for i in (0, -1))
         headers.append([f"{label}: {title} {worst}", "", "", f"{title} {best}", "", ""])
         told.append(f"{label} {worst} and {best}")
-    if not lines:
-        return None
     titles = [f"{which}: {what}" for which in ("worst", "best") for what in _TRIPLE]
     _draw_lines(lines, titles, results.smoke, out_dir, "extremes", headers)
     return (
@@ -117,26 +144,33 @@ def _found(results: "Results", runs_root: Path, kind: str = "") -> list[tuple[st
     return found
 
 
-def _triple(samples: Samples, index: int) -> list[Image | None]:
-    image, picture = samples.image[index], facts.PICTURES[0]
+def _labels(results: "Results") -> LabelSet:
+    """The classes of the data set that the cells share; imports it."""
+    dataset = results.groups[0].rows[0]["cell"]["recipe"]["data"]["dataset"]
+    labels: LabelSet = plugins.load("datasets", dataset.replace("-", "_")).labels
+    return labels
+
+
+def _triple(samples: Samples, index: int, picture: Picture, labels: LabelSet) -> list[Image | None]:
+    image = samples.image[index]
     maps = (samples.maps[f"true_{picture.key}"][index], samples.maps[picture.key][index])
-    return [_fit(image), *(_map(picture, image, values) for values in maps)]
+    return [_fit(image), *(_map(picture, image, values, labels) for values in maps)]
 
 
-def _lines(runs: Sequence[Samples], images: int) -> list[list[Image | None]]:
+def _lines(runs: Sequence[Samples], images: int, labels: LabelSet) -> list[list[Image | None]]:
     """Tiles, line by line; None where there is nothing to show."""
     lines: list[list[Image | None]] = []
     for index, name in enumerate(runs[0].names[:images]):
         image = runs[0].image[index]
         found = [(run, run.names.index(name)) if name in run.names else None for run in runs]
         start: Image | None = _fit(image)
-        for picture in facts.PICTURES:
+        for picture in pictures():
             maps = [_of(pair, picture.key) for pair in found]
             truths = (_of(pair, f"true_{picture.key}") for pair in found)
             truth = next((m for m in truths if m is not None), None)
             if truth is None and all(m is None for m in maps):
                 continue  # no run has this task
-            tiles = [m if m is None else _map(picture, image, m) for m in (truth, *maps)]
+            tiles = [m if m is None else _map(picture, image, m, labels) for m in (truth, *maps)]
             lines.append([start, *tiles])
             start = None  # the input stands in an image's first line only
     return lines
@@ -146,14 +180,14 @@ def _of(pair: tuple[Samples, int] | None, key: str) -> NDArray[Any] | None:
     return pair[0].maps[key][pair[1]] if pair is not None and key in pair[0].maps else None
 
 
-def _map(picture: Picture, image: Image, values: NDArray[Any]) -> Image:
+def _map(picture: Picture, image: Image, values: NDArray[Any], labels: LabelSet) -> Image:
     """Drawn at the tile's size, so that outlines keep their width."""
     small = _fit(image)
     height, width = small.shape[:2]
     values = values.astype(np.float32) if values.dtype.kind == "f" else values
     # nothing is invented between pixels
     values = cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST)
-    return picture.draw(small, values)
+    return picture.draw(small, values, labels)
 
 
 def _fit(image: Image) -> Image:

@@ -5,7 +5,7 @@ A Pareto front has the points that no other point beats in both of two numbers.
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +17,9 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from mtl_bench.core.columns import FPS, Column
-from mtl_bench.report import facts
+from mtl_bench.core.style import BASELINE, GRAY, MANY, Look, looks, save, styled
 from mtl_bench.report.columns import capital
 from mtl_bench.report.statistics import SMOKE, Group
-from mtl_bench.report.style import BASELINE, GRAY, MANY, Look, looks, save, styled
 from mtl_bench.report.table import NOTHING, number
 
 if TYPE_CHECKING:
@@ -81,10 +80,9 @@ def classes(results: "Results", column: Column, out_dir: Path, name: str) -> str
     """
     values = {group.label: _per_class(group, column) for group in results.groups}
     values = {label: quality for label, quality in values.items() if quality}
-    found = dict.fromkeys(name for quality in values.values() for name in quality)
-    if not found:
+    if not values:
         return None
-    names = sorted(found, key=lambda n: facts.CLASSES.index(n) if n in facts.CLASSES else math.inf)
+    names = _merged(values.values())
     heat = np.array([[quality.get(n, math.nan) for n in names] for quality in values.values()])
     texts = [[NOTHING if math.isnan(v) else f"{v:.0f}" for v in line] for line in heat]
     high = 100 if column.unit == "%" else float(np.nanmax(heat))
@@ -226,6 +224,18 @@ def _per_class(group: Group, column: Column) -> dict[str, float]:
         found = {key.fullmatch(name): value for name, value in row.get("metric", {}).items()}
         per_seed.append({m[1]: v * column.scale for m, v in found.items() if m and v is not None})
     return {str(k): float(v) for k, v in pd.DataFrame(per_seed, dtype=float).mean().items()}
+
+
+def _merged(several: Iterable[Iterable[str]]) -> list[str]:
+    """All names, each behind the one that it follows where it first occurs."""
+    found: list[str] = []
+    for names in several:
+        place = 0
+        for name in names:
+            if name not in found:
+                found.insert(place, name)
+            place = found.index(name) + 1
+    return found
 
 
 def watermark(axes: Axes, results: "Results") -> None:

@@ -159,7 +159,8 @@ def build_method(cell: Cell, terms: Sequence[Term]) -> Method:
     seed = seed_for(cell.seed, "method")
     names = plugins.part_names(cell.method)
     if len(names) == 1:
-        return plugins.load("methods", cell.method)(terms, seed=seed, **cell.method_args)
+        found: Method = plugins.load("methods", cell.method)(terms, seed=seed, **cell.method_args)
+        return found
     parts = [
         plugins.load("methods", name)(terms, seed=seed, **cell.method_args.get(name, {}))
         for name in names
@@ -177,7 +178,8 @@ def schedule(step: int, optim: Optim) -> float:
     warm = 1.0
     if step < optim.warmup_steps:
         warm = optim.warmup_factor + (1 - optim.warmup_factor) * step / optim.warmup_steps
-    return warm * (1 - step / optim.steps) ** optim.poly_power
+    found: float = warm * (1 - step / optim.steps) ** optim.poly_power
+    return found
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, optim: Optim, step: int) -> float:

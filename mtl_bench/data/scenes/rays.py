@@ -74,7 +74,8 @@ def rotation(yaw_rad: float, pitch_rad: float) -> DoubleArray:
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     yaw = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     c, s = np.cos(pitch_rad), np.sin(pitch_rad)
-    return yaw @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+    found: DoubleArray = yaw @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])
+    return found
 
 
 def draw_camera(rng: np.random.Generator, height: int, width: int) -> Camera:
@@ -185,7 +186,7 @@ class Solids:
 class Collector:
     """Objects in, `Solids` out."""
 
-    rows: list[tuple] = field(default_factory=list)
+    rows: list[tuple[Any, ...]] = field(default_factory=list)
     objects: int = 0
 
     def place(
@@ -270,7 +271,10 @@ def screen_bounds(
 # --- rays in unit space: origin o and direction d as three broadcastable arrays -> depth ----------
 
 
-def hit(kind: int, o: tuple, d: tuple, taper: tuple) -> FloatArray:
+Rays = tuple[Any, Any, Any]  # three arrays that broadcast against each other
+
+
+def hit(kind: int, o: Rays, d: Rays, taper: Rays) -> FloatArray:
     """Depth at which rays enter the unit solid; infinite where they miss or start inside."""
     if kind == BOX:
         enter, leave = _slab(o[0], d[0])
@@ -292,13 +296,13 @@ def hit(kind: int, o: tuple, d: tuple, taper: tuple) -> FloatArray:
     return np.where((enter <= leave) & (enter > NEAR_M), enter, np.float32(np.inf))
 
 
-def _slab(o, d):
+def _slab(o: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
     inverse = 1 / d
     middle, half = o * inverse, np.abs(inverse)
     return -middle - half, half - middle
 
 
-def _tapered(o, d, taper):
+def _tapered(o: Rays, d: Rays, taper: Rays) -> tuple[FloatArray, FloatArray]:
     """Six half-spaces n.p <= c; the four sides lean inwards, as y = -1 is the top."""
     enter, leave = _slab(o[1], d[1])
     sides, front, rear = (k / 2 for k in taper)
@@ -310,7 +314,7 @@ def _tapered(o, d, taper):
     return enter, leave
 
 
-def unit_normals(kind: NDArray, p: FloatArray, taper: FloatArray) -> FloatArray:
+def unit_normals(kind: NDArray[Any], p: FloatArray, taper: FloatArray) -> FloatArray:
     """Outward normals [N,3] in unit space at surface points p [N,3] of solids of mixed kinds."""
     normal = p.copy()  # ellipsoid
     flat = np.flatnonzero(kind == BOX)
@@ -335,7 +339,8 @@ def _tapered_normals(q: FloatArray, lean: FloatArray) -> FloatArray:
         normals[i, :, axis], normals[i, :, 1] = sign, -lean[:, which]
         limit[i] -= lean[:, which]
     nearest = ((normals * q).sum(2) - limit).argmax(0)
-    return normals[nearest, np.arange(len(q))]
+    found: FloatArray = normals[nearest, np.arange(len(q))]
+    return found
 
 
 _SMALL = 600  # rays; up to here the cost of a call outweighs that of the pairs
@@ -382,7 +387,9 @@ def cast(
     return depth, index
 
 
-def _range(low: FloatArray, high: FloatArray, samples: FloatArray) -> tuple[NDArray, NDArray]:
+def _range(
+    low: FloatArray, high: FloatArray, samples: FloatArray
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """First and one-past-last sample inside [low, high], a little widened against rounding."""
     step = float(samples[1] - samples[0]) if len(samples) > 1 else 1.0
     limit = len(samples)
@@ -391,7 +398,9 @@ def _range(low: FloatArray, high: FloatArray, samples: FloatArray) -> tuple[NDAr
     return first.astype(np.int64), last.astype(np.int64)
 
 
-def _pairs(solids: NDArray, r0: NDArray, c0: NDArray, wide: NDArray, area: NDArray):
+def _pairs(
+    solids: NDArray[Any], r0: NDArray[Any], c0: NDArray[Any], wide: NDArray[Any], area: NDArray[Any]
+) -> tuple[NDArray[Any], ...]:
     """All (solid, row, column) of image boxes given by corner, width and area, as flat arrays."""
     which = np.repeat(np.arange(len(solids)), area)
     within = np.arange(len(which)) - np.repeat(np.cumsum(area) - area, area)
@@ -400,7 +409,7 @@ def _pairs(solids: NDArray, r0: NDArray, c0: NDArray, wide: NDArray, area: NDArr
 
 
 def _keep_nearest(
-    depth: FloatArray, index: NDArray, solid: NDArray, ray: NDArray, t: FloatArray
+    depth: FloatArray, index: NDArray[Any], solid: NDArray[Any], ray: NDArray[Any], t: FloatArray
 ) -> None:
     """Put the nearest of several hits of a ray into the flat views of depth and index."""
     flat_depth, flat_index = depth.reshape(-1), index.reshape(-1)

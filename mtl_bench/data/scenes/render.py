@@ -5,6 +5,7 @@ rays a quarter of a pixel from it where these see different solids, and one samp
 box-filtered) texture where they see the same.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,7 +137,10 @@ def _draw_light(rng: np.random.Generator) -> Light:
     zenith = ((0.3, 0.5, 0.85), (0.72, 0.75, 0.8), (0.45, 0.55, 0.8))[weather]
     horizon = ((0.75, 0.85, 0.97), (0.86, 0.87, 0.88), (0.98, 0.86, 0.72))[weather]
     exposure = rng.uniform(0.78, 1.12)
-    as_color = lambda c, k=1.0: np.array(c, np.float32) * np.float32(k)  # noqa: E731
+
+    def as_color(color: Sequence[float], factor: float = 1.0) -> NDArray[np.float32]:
+        return np.array(color, np.float32) * np.float32(factor)
+
     return Light(
         sun_3=as_color(sun),
         sun_color_3=as_color(tint, strength * exposure),
@@ -223,7 +227,12 @@ def _centres(camera: Camera) -> tuple[FloatArray, FloatArray]:
 
 
 def _faces(
-    scene: Scene, frame: int, u_W: FloatArray, v_H: FloatArray, index: NDArray, depth: FloatArray
+    scene: Scene,
+    frame: int,
+    u_W: FloatArray,
+    v_H: FloatArray,
+    index: NDArray[Any],
+    depth: FloatArray,
 ) -> NDArray[np.int32]:
     """Which pair of faces of a box or cylinder a ray hits, 0..2; 0 for the round and the sky."""
     rows, cols = np.nonzero(index >= 0)
@@ -250,7 +259,7 @@ def _colors(
     frame: int,
     u_N: FloatArray,
     v_N: FloatArray,
-    index_N: NDArray,
+    index_N: NDArray[Any],
     depth_N: FloatArray,
 ) -> FloatArray:
     """Colours [N,3] of what the rays through (u, v) see at a known depth."""
@@ -279,11 +288,12 @@ def _sky(light: Light, direction_N3: FloatArray) -> FloatArray:
     puffs = lattice_noise(flat) + 0.5 * lattice_noise(flat * 2.3)
     share = np.clip(puffs * 0.9 + light.cloud - 0.35, 0, 1)[:, None] * np.sqrt(rise) * 0.8
     white = np.array([0.95, 0.95, 0.96], np.float32) * light.horizon_3.max()
-    return color + (white - color) * share
+    found: FloatArray = color + (white - color) * share
+    return found
 
 
 def _surface(
-    scene: Scene, frame: int, index_N: NDArray, unit_N3: FloatArray, world_N3: FloatArray
+    scene: Scene, frame: int, index_N: NDArray[Any], unit_N3: FloatArray, world_N3: FloatArray
 ) -> FloatArray:
     """Colours [N,3] of surface points given in unit and world space."""
     solids, light, viewer = scene.solids, scene.light, scene.viewer(frame)
@@ -324,7 +334,8 @@ def _surface(
     contact = _contact(scene, frame, world_N3, footprint, stretched)[:, None]
     color = albedo * (light.ambient_3 * sky_share + light.sun_color_3 * shade) * contact
     air = 1 - np.exp(-depth_N / np.float32(light.haze_m))[:, None]
-    return color + (light.horizon_3 * 0.9 - color) * air
+    found: FloatArray = color + (light.horizon_3 * 0.9 - color) * air
+    return found
 
 
 def _contact(

@@ -76,6 +76,6 @@ class Settings:
         (root / "synthetic.json").write_text(json.dumps(self.values, indent=4) + "\n")
 
 
-def write_png(path: Path, image: NDArray) -> None:
+def write_png(path: Path, image: NDArray[Any]) -> None:
     if not cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, _FAST):
         raise OSError(f"cannot write {path}")

@@ -8,7 +8,7 @@ surface) and blur themselves to it.
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +118,8 @@ def lattice_noise(points_N3: FloatArray) -> FloatArray:
     c = _CORNERS[(i[:, 0] << 2 * _BITS) | (i[:, 1] << _BITS) | i[:, 2]]
     c = c[:, :4] + (c[:, 4:] - c[:, :4]) * f[:, 0, None]
     c = c[:, :2] + (c[:, 2:] - c[:, :2]) * f[:, 1, None]
-    return c[:, 0] + (c[:, 1] - c[:, 0]) * f[:, 2]
+    found: FloatArray = c[:, 0] + (c[:, 1] - c[:, 0]) * f[:, 2]
+    return found
 
 
 def fractal_noise(
@@ -164,7 +165,7 @@ def mix(a: FloatArray, b: FloatArray, share_N: FloatArray) -> FloatArray:
     return a + (b - a) * share_N[:, None]
 
 
-def cell_random(a: NDArray, b: NDArray) -> FloatArray:
+def cell_random(a: NDArray[Any], b: NDArray[Any]) -> FloatArray:
     """A number in [0,1) for every integer pair: which window is lit."""
     h = (a.astype(np.int64) * 73856093) ^ (b.astype(np.int64) * 19349663)
     return (((h * 2654435761) >> 8) & 1023).astype(np.float32) / 1024

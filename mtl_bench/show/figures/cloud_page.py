@@ -15,8 +15,8 @@ import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.canvas import VOID, LogScale
 from mtl_bench.core.labels import DIVISOR, LabelSet
-from mtl_bench.show import render
 from mtl_bench.show.figures.frames import Shown
 from mtl_bench.show.predict.files import OVERLAP, denser
 from mtl_bench.show.predict.point_cloud import PointCloud, from_prediction
@@ -35,21 +35,22 @@ def cloud_page(shown: Shown, run: str) -> str:
         run: which model this is from, in words.
 
     Raises:
-        ValueError: a prediction without depth.
+        ValueError: a prediction without a surface.
     """
-    predicted = shown.predicted
+    predicted, surface = shown.predicted, shown.predicted.surface
     rows, columns = predicted.image_HW3.shape[:2]
-    times = 1
-    if predicted.depth_HW is not None:
-        times = min(8, math.ceil((DRAWN_POINTS / (rows * columns)) ** 0.5))
+    times = min(8, math.ceil((DRAWN_POINTS / (rows * columns)) ** 0.5))
+    if surface is not None:
         predicted = denser(predicted, times)
     cloud = from_prediction(predicted, shown.labels)
+    assert surface is not None
     notes = [f"{rows} x {columns} pixels"]
     notes += [f"interpolated to {times * rows} x {times * columns}"] * (times > 1)
-    if predicted.camera_height is not None:
-        near = cloud.points_N3[:, 2] <= FARTHEST * predicted.camera_height
-        limit = f"{FARTHEST * predicted.camera_height:.0f} {cloud.unit}"
-        notes.append(f"camera {predicted.camera_height:.3g} {cloud.unit} above the road")
+    height = surface.camera_height
+    if height is not None:
+        near = cloud.points_N3[:, 2] <= FARTHEST * height
+        limit = f"{FARTHEST * height:.0f} {cloud.unit}"
+        notes.append(f"camera {height:.3g} {cloud.unit} above the road")
         notes += [f"{np.count_nonzero(~near)} points beyond {limit} left out"] * (not near.all())
         cloud = chosen(cloud, near)
     if len(cloud) > POINTS:
@@ -59,35 +60,34 @@ def cloud_page(shown: Shown, run: str) -> str:
         "name": shown.name,
         "run": run,
         "notes": "; ".join([*notes, f"{len(cloud)} points shown"]),
-        "height": predicted.camera_height,
+        "height": height,
         "pitch": shown.camera.pitch_rad,
         "pixel": OVERLAP / float(predicted.K_33[0, 0]),
     }
-    return page_of(cloud, shown.labels, about)
+    return page_of(cloud, shown.labels, about, surface.scale(cloud.points_N3[:, 2]))
 
 
-def page_of(cloud: PointCloud, labels: LabelSet, about: dict[str, Any]) -> str:
+def page_of(cloud: PointCloud, labels: LabelSet, about: dict[str, Any], scale: LogScale) -> str:
     """The page of any cloud.
 
     Args:
-        about: name, run and notes, shown as they are; height of the camera above the road or None,
-            and its pitch; pixel: size of a point at depth 1.
+        about: name, run and notes, shown as they are; height of the camera above the ground or
+            None, and its pitch; pixel: size of a point at depth 1.
+        scale: colours of depth.
     """
     points_N3 = leveled(cloud.points_N3, about["pitch"])
     lowest = points_N3.min(0) if len(cloud) else np.zeros(3)
     extent = np.maximum((points_N3.max(0) if len(cloud) else np.ones(3)) - lowest, 1e-6)
     steps_N3 = np.rint((points_N3 - lowest) / extent * STEPS).astype("<u2")
     ids, segment_N = np.unique(cloud.ids_N, return_inverse=True)
-    near, far = render.depth_range(cloud.points_N3[:, 2], cloud.unit)
-    table = render.depth_colors(np.geomspace(near, far, 256)[None], near, far)
     facts = {
         **about,
         "unit": cloud.unit,
         "low": lowest.tolist(),
         "extent": extent.tolist(),
-        "near": near,
-        "far": far,
-        "table": table[0].ravel().tolist(),
+        "near": scale.low,
+        "far": scale.high,
+        "table": scale.ramp(256).ravel().tolist(),
         "segments": [_segment(int(number), labels) for number in ids],
     }
     data = {
@@ -135,7 +135,7 @@ def _segment(number: int, labels: LabelSet) -> dict[str, Any]:
     found = [label for label in labels.labels if label.label_id == label_id]
     return {
         "name": found[0].name if found else "no class",
-        "color": list(found[0].color if found else render.panoptic.VOID),
+        "color": list(found[0].color if found else VOID),
         "instance": number if number >= DIVISOR else 0,
     }
 

@@ -9,11 +9,9 @@ import numpy as np
 from mtl_bench.bench.jobs import load_cell
 from mtl_bench.bench.stored import load_model
 from mtl_bench.core.config import Cell, did_you_mean
+from mtl_bench.core.dataset import dataset_in, layouts
 from mtl_bench.core.device import Engine, choose_device
 from mtl_bench.core.labels import LabelSet
-from mtl_bench.data import cityscapes_files as cityscapes
-from mtl_bench.data import kitti_files, kitti_splits
-from mtl_bench.data.layouts import KITTI, layout_of
 from mtl_bench.show.predict import Predicted, Predictor
 from mtl_bench.show.predict.cameras import Given, Mounted, camera_of
 from mtl_bench.show.predict.video import read_image
@@ -48,19 +46,12 @@ def frames_in(root: Path, split: str) -> dict[str, Path]:
     """Names and image files of a split's frames, in order; no ground truth is needed.
 
     Raises:
-        ValueError: no such split, or none of its frames.
+        ValueError: no known data set, no such split, or none of its frames.
     """
-    if layout_of(root) == KITTI:
-        tree = kitti_files.Tree(root)
-        listed = kitti_splits.frames_of(root, split)
-        found = {frame.name: tree.image(frame) for frame in listed if tree.has_image(frame)}
-        if not found:
-            raise ValueError(f"{root}: no frame of split '{split}' is there")
-        return found
-    kind = cityscapes.IMAGE
-    names = cityscapes.annotated_names(root, split)
-    folder = root / kind.folder / split
-    return {name: cityscapes.file_of(folder, kind, name) for name in names}
+    dataset = dataset_in(root)
+    if dataset is None:
+        raise ValueError(f"{root} has none of {', '.join(layouts())}")
+    return dataset.image_files(root, split)
 
 
 def choose(names: Sequence[str], wanted: Sequence[str], seed: int, count: int) -> list[str]:

@@ -1,8 +1,8 @@
 """Predictions for a user's images or video: from files through the model into a folder.
 
     <out>/prediction.json    input, cameras, scale, model, speed; the units of the other files
-    <out>/NAME_...           of images, see prediction_files
-    <out>/NAME.mp4           of a video: panoptic map and depth side by side
+    <out>/NAME_...           of images, see `files`
+    <out>/NAME.mp4           of a video: the tasks' pictures side by side
     <out>/NAME_000000_...    of a video's frames, where they are asked for
 
 One frame is in memory at a time. The folder appears under its name, whole, at the very end.
@@ -19,7 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.show.predict import Image, Predicted, Predictor
+from mtl_bench.core.canvas import Image
+from mtl_bench.core.view import Surface
+from mtl_bench.show.predict import Predicted, Predictor
 from mtl_bench.show.predict.cameras import Given, Mounted, camera_of
 from mtl_bench.show.predict.files import video_frame, write_files
 from mtl_bench.show.predict.recording import Recording, missing
@@ -35,12 +37,12 @@ class Job:
 
     predictor: Predictor
     given: Given
-    kinds: Collection[str]  # of prediction_files.KINDS; what the cell's tasks lack is left out
+    kinds: Collection[str]  # of files; what the cell's tasks lack is left out
     recording: Recording | None = None
     progress: Progress | None = None
     frames: int = 0
     predict_s: float = 0.0
-    scales: Counter = field(default_factory=Counter)  # "m by road": frames
+    scales: Counter[str] = field(default_factory=Counter)  # "m by road": frames
     began: float = field(default_factory=time.perf_counter)
 
     def predict(self, name: str, image_HW3: Image, camera: Mounted) -> Predicted:
@@ -48,8 +50,8 @@ class Job:
         start = time.perf_counter()
         predicted = self.predictor(image_HW3, camera.K_33, camera.height_m, camera.pitch_rad)
         self.predict_s += time.perf_counter() - start
-        if predicted.unit is not None:
-            self.scales[_scale_in_words(predicted)] += 1
+        if predicted.surface is not None:
+            self.scales[_scale_in_words(predicted.surface)] += 1
         if self.recording is not None:
             self.recording.add(self.frames, name, predicted)
         return predicted
@@ -93,7 +95,9 @@ def predict_images(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, A
         base.parent.mkdir(parents=True, exist_ok=True)
         write_files(base, predicted, job.kinds, job.predictor.labels)
         image = {"input": str(path), "name": stem, "size": list(image_HW3.shape[:2])}
-        scale = {"unit": predicted.unit, "scale_from": predicted.scale_source}
+        surface = predicted.surface
+        unit, source = (surface.unit, surface.source) if surface else (None, None)
+        scale = {"unit": unit, "scale_from": source}
         images.append({**image, "camera": _camera(camera), **scale})
         job.done(len(paths))
     return {**job.record, "images": images}
@@ -108,14 +112,13 @@ def predict_video(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, An
     (path,) = paths
     reader = Reader(path)
     camera = camera_of(path, reader.size, job.given)
-    labels = job.predictor.labels
     video = folder / f"{path.stem}.mp4"
     with Writer(video, reader.fps) as writer:
         for number, image_HW3 in enumerate(reader):
             stem = f"{path.stem}_{number:06d}"
             predicted = job.predict(stem, image_HW3, camera)
-            writer.write(video_frame(predicted, labels))
-            write_files(folder / stem, predicted, job.kinds, labels)
+            writer.write(video_frame(predicted))
+            write_files(folder / stem, predicted, job.kinds, job.predictor.labels)
             job.done(reader.frames)
     about = {"input": str(path), "size": list(reader.size), "video_fps": reader.fps}
     return {**job.record, **about, "camera": _camera(camera), "video": video.name}
@@ -132,9 +135,9 @@ def _camera(camera: Mounted) -> dict[str, Any]:
     return {**values, "height_m": camera.height_m, "pitch_rad": camera.pitch_rad}
 
 
-def _scale_in_words(predicted: Predicted) -> str:
-    found = predicted.camera_height is not None
-    return f"{predicted.unit}, scale from {predicted.scale_source if found else 'nowhere'}"
+def _scale_in_words(surface: Surface) -> str:
+    found = surface.camera_height is not None
+    return f"{surface.unit}, scale from {surface.source if found else 'nowhere'}"
 
 
 def summary(record: dict[str, Any], predictor: Predictor) -> list[str]:

@@ -5,7 +5,6 @@ N points, H x W pixels.
 """
 
 import io
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mtl_bench.core.canvas import Image
+from mtl_bench.core.files import write_bytes
 from mtl_bench.core.geometry import back_project
-from mtl_bench.core.labels import DIVISOR, LabelSet, class_of_instance_id
-from mtl_bench.show.predict import Image, Predicted, without_surface
+from mtl_bench.core.labels import (
+    DIVISOR,
+    NO_SURFACE,
+    NUMBERING,
+    LabelSet,
+    class_of_instance_id,
+)
+from mtl_bench.core.quality import declared
+from mtl_bench.show.predict import Predicted
 
+POINTS = "points"  # the kind of files that a cloud makes, which tasks with a surface declare
 _POSITION, _COLOR = ("x", "y", "z"), ("red", "green", "blue")
 _VERTEX = np.dtype(
     [
@@ -35,32 +44,34 @@ class PointCloud:
 
     points_N3: NDArray[np.float32]  # in `unit`
     colors_N3: Image  # RGB, the image's
-    class_N: NDArray[np.uint8]  # Cityscapes' label id (7 = road), the instance's; 0 = none
-    instance_N: NDArray[np.uint16]  # Cityscapes' instance id (26001) of a thing; 0 = none
-    unit: str  # as predict.METRES, HEIGHTS, UNSCALED
+    class_N: NDArray[np.uint8]  # label id, the instance's; 0 = none
+    instance_N: NDArray[np.uint16]  # instance id of a thing; 0 = none
+    unit: str  # of a Surface
 
     def __len__(self) -> int:
         return len(self.points_N3)
 
     @property
     def ids_N(self) -> NDArray[np.int32]:
-        """Cityscapes' instance ids, of stuff its label id: what `render.segment_colors` takes."""
+        """Instance ids, of stuff its label id."""
         return np.where(self.instance_N > 0, self.instance_N, self.class_N).astype(np.int32)
 
 
 def from_prediction(predicted: Predicted, labels: LabelSet) -> PointCloud:
-    """The cloud of an image's prediction; without a panoptic task all classes are 0.
+    """The cloud of an image's prediction; without segments all classes are 0.
 
     Raises:
-        ValueError: a prediction without depth.
+        ValueError: a prediction without a surface.
     """
-    if predicted.depth_HW is None or predicted.unit is None:
-        raise ValueError("no depth is predicted, so there is no point cloud: train the task depth")
-    ids_HW = predicted.instance_ids_HW
-    if ids_HW is None:
-        ids_HW = np.zeros(predicted.depth_HW.shape, np.int32)
-    image_HW3, K_33 = predicted.image_HW3, predicted.K_33
-    return from_maps(image_HW3, predicted.depth_HW, ids_HW, K_33, labels, predicted.unit)
+    surface, segments = predicted.surface, predicted.segments
+    if surface is None:
+        able = [task for task, kinds in declared("files").items() if POINTS in kinds]
+        raise ValueError(
+            f"no depth is predicted, so there is no point cloud: train the task {' or '.join(able)}"
+        )
+    depth_HW = surface.depth_HW
+    ids_HW = np.zeros(depth_HW.shape, np.int32) if segments is None else segments.ids_HW
+    return from_maps(predicted.image_HW3, depth_HW, ids_HW, predicted.K_33, labels, surface.unit)
 
 
 def from_maps(
@@ -71,11 +82,10 @@ def from_maps(
     labels: LabelSet,
     unit: str,
 ) -> PointCloud:
-    """Every pixel's point, but those of sky, of the ego vehicle and without a valid depth.
+    """Every pixel's point, but those of classes without a surface and without a valid depth.
 
     Args:
         depth_HW: 0 or not finite = no value.
-        instance_ids_HW: Cityscapes' ids.
         K_33: intrinsics in pixels of these maps.
     """
     depth_11HW = torch.from_numpy(np.asarray(depth_HW, np.float64))[None, None]
@@ -83,7 +93,7 @@ def from_maps(
     points_HW3 = back_project(depth_11HW, K_133)[0].permute(1, 2, 0).numpy()
     class_HW = class_of_instance_id(labels)[instance_ids_HW]
     kept_HW = np.isfinite(depth_HW) & (np.asarray(depth_HW) > 0)
-    kept_HW &= ~np.isin(class_HW, without_surface(labels))
+    kept_HW &= ~np.isin(class_HW, labels.of_role(NO_SURFACE))
     ids_N = instance_ids_HW[kept_HW]
     return PointCloud(
         points_N3=points_HW3[kept_HW].astype(np.float32),
@@ -111,14 +121,14 @@ def write_ply(path: Path, cloud: PointCloud, labels: LabelSet) -> None:
         "format binary_little_endian 1.0",
         "comment camera axes, the camera at the origin: x right, y down, z forward",
         f"comment unit of x y z: {cloud.unit}",
-        "comment class: Cityscapes label id, 0 = none: " + ", ".join(names),
-        "comment instance: Cityscapes instance id (label id * 1000 + number), 0 = none",
+        f"comment class: {NUMBERING} label id, 0 = none: " + ", ".join(names),
+        f"comment instance: {NUMBERING} instance id (label id * {DIVISOR} + number), 0 = none",
         f"element vertex {len(cloud)}",
     ]
     for name in _VERTEX.names or ():
         lines.append(f"property {_PLY_TYPES[_VERTEX[name].str]} {name}")
     header = "\n".join([*lines, "end_header\n"]).encode("ascii")
-    _write_whole(path, header + vertices.tobytes())
+    write_bytes(path, header + vertices.tobytes())
 
 
 def write_npz(path: Path, cloud: PointCloud) -> None:
@@ -132,14 +142,4 @@ def write_npz(path: Path, cloud: PointCloud) -> None:
         instances=cloud.instance_N,
         unit=np.array(cloud.unit),
     )
-    _write_whole(path, data.getvalue())
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """By a temporary sibling, of which a full disk leaves nothing."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, data.getvalue())

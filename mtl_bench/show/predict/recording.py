@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from mtl_bench.core.labels import LabelSet
-from mtl_bench.show.predict import METRES, Predicted
+from mtl_bench.core.view import METRES, Surface
+from mtl_bench.show.predict import Predicted
 from mtl_bench.show.predict.point_cloud import from_prediction
-from mtl_bench.show.render import overlay
 
 MOST_POINTS = 50_000  # a frame: of a video's 200 frames all points would be gigabytes
 
@@ -52,13 +52,15 @@ class Recording:
         )
         stream.log("world/camera", camera)
         stream.log("world/camera/image", rerun.Image(predicted.image_HW3).compress())
-        if predicted.instance_ids_HW is not None:
-            colored = overlay(predicted.image_HW3, predicted.instance_ids_HW, self.labels)
-            stream.log("world/camera/panoptic", rerun.Image(colored).compress())
-        if predicted.depth_HW is not None:
-            metre = 1.0 if predicted.unit == METRES else None
-            depth = rerun.DepthImage(predicted.depth_HW.astype(np.float32), meter=metre)
-            stream.log("world/camera/depth", depth)
+        for view in predicted.views:
+            place = f"world/camera/{view.task}"
+            if isinstance(view, Surface):
+                metre = 1.0 if view.unit == METRES else None
+                depth_HW = view.depth_HW.astype(np.float32)
+                stream.log(place, rerun.DepthImage(depth_HW, meter=metre))
+            else:
+                stream.log(place, rerun.Image(view.picture(predicted.image_HW3)).compress())
+        if predicted.surface is not None:
             cloud = from_prediction(predicted, self.labels)
             step = 1 + len(cloud) // MOST_POINTS
             points = rerun.Points3D(

@@ -20,15 +20,17 @@ from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.columns import Column
 from mtl_bench.core.dataset import NEIGHBOURS, Dataset
 from mtl_bench.core.geometry import back_project, depth_from_inverse
-from mtl_bench.core.labels import GROUND, NO_SURFACE
+from mtl_bench.core.labels import GROUND, NO_SURFACE, LabelSet
 from mtl_bench.core.recipe import Evaluate, Network
 from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
+from mtl_bench.core.view import METRES
 from mtl_bench.model.layers import Decoder, Head, full
 from mtl_bench.tasks import pixels
 from mtl_bench.tasks.depth import protocols
 from mtl_bench.tasks.depth.losses import photometric_loss, smoothness_loss
 from mtl_bench.tasks.depth.metrics import DepthErrors, evaluation_mask, median_scale
+from mtl_bench.tasks.depth.picture import HEIGHTS, UNSCALED, DepthView
 from mtl_bench.tasks.depth.pose import PoseNetwork
 from mtl_bench.tasks.depth.protocols import Protocol
 from mtl_bench.tasks.depth.scale import DGC_SOURCES, FAILED, NORMALS, ROAD, dgc_scale
@@ -97,6 +99,27 @@ class Depth(Task):
             *("rmse_dgc", "depth_dgc.rmse", "RMSE dgc", -1, 2, "m"), note="dgc-scaled", short=True
         ),
     )
+    files = ("depth", "points")
+    drawn: ClassVar[Mapping[str, str]] = {
+        "depth_m": "depth (median-scaled, 2 m bright to 80 m dark, gray without value)",
+    }
+    agreement = (
+        Column(
+            *("depth_rel", "agreement.depth_median_rel", "depth", -1, 0, "median diff."),
+            scientific=True,
+            words="depth relative",
+        ),
+    )
+    counts: ClassVar[Mapping[str, str]] = {
+        "dgc.failed": "no scale found",
+        "dgc.fallback": "scale from surface normals",
+    }
+    words: ClassVar[Mapping[str, str]] = {
+        "trivial": "mean depth image",
+        "trivial_note": "Its depth is in metres already, so nothing scales it under dgc.",
+        "timed": "metric depth",
+        "counted": "Images whose depth was not scaled from the road",
+    }
 
     # --- network ----------------------------------------------------------------------------------
 
@@ -217,6 +240,26 @@ class Depth(Task):
     def trivial(self, size: Size) -> Trivial:
         return MeanDepth(self.recipe.evaluate, size)
 
+    # --- for a viewer -----------------------------------------------------------------------------
+
+    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> DepthView:
+        """In the network's unit where no scale was found; 0 where the class has no surface."""
+        found = {name: value[0].cpu() for name, value in results[self.name].items()}
+        depth_HW, source = found["depth"][0].numpy(), int(found["source"])
+        unit, height = UNSCALED, None
+        if source != FAILED:
+            unit, height = METRES if camera_height_m else HEIGHTS, camera_height_m or 1.0
+            depth_HW = depth_HW * np.float32(found["scale"].item())
+        classes = _classes(results, "class")
+        if classes is not None:
+            nothing = self.labels.of_role(NO_SURFACE)
+            depth_HW = depth_HW * ~np.isin(classes[0].cpu().numpy(), nothing)
+        return DepthView(depth_HW, unit, DGC_SOURCES[source], height)
+
+    @classmethod
+    def drawn_view(cls, name: str, map_HW: NDArray[Any], labels: LabelSet) -> DepthView:
+        return DepthView(np.asarray(map_HW, np.float32), METRES)
+
 
 def _classes(results: Mapping[str, Results], key: str) -> Tensor | None:
     """The class map of whichever task has one."""
@@ -256,8 +299,13 @@ class DepthMetric(Metric):
 
     def state(self) -> dict[str, NDArray[Any]]:
         found = {f"errors.{key}": errors.state() for key, errors in self.errors.items()}
-        ratios = np.array(self.scale_ratios)
-        return {**found, "sources": self.sources, "ratios": ratios, "frames": np.array(self.frames)}
+        return {
+            **found,
+            "sources": self.sources,
+            "ratios": np.array(self.scale_ratios),
+            "frames": np.array(self.frames),
+            "sizes": np.array(list(self.sizes), np.int64).reshape(-1, 2),
+        }
 
     def add(self, state: Mapping[str, NDArray[Any]]) -> None:
         for key, errors in self.errors.items():
@@ -265,6 +313,7 @@ class DepthMetric(Metric):
         self.sources += state["sources"]
         self.scale_ratios += state["ratios"].tolist()
         self.frames += int(state["frames"])
+        self.sizes |= dict.fromkeys((height, width) for height, width in state["sizes"].tolist())
 
     def compute(self) -> dict[str, float]:
         metrics: dict[str, float] = {}
@@ -309,7 +358,8 @@ class MeanDepth(Trivial):
             self.depth_count == 0, return_distances=False, return_indices=True
         )
         mean_HW = self.depth_sum / np.maximum(self.depth_count, 1)
-        return mean_HW[tuple(nearest)].astype(np.float32)
+        found: NDArray[np.float32] = mean_HW[tuple(nearest)].astype(np.float32)
+        return found
 
     def result(self, count: int, size: Size) -> Results:
         depth_m_HW = torch.from_numpy(pixels.sampled(self.depth_m_HW(), size))

@@ -7,6 +7,7 @@ depth error to the segmentation).
 """
 
 import typing
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ class Limits(typing.Protocol):
     def depth_crop(self) -> str: ...
 
 
-def evaluation_mask(true_m_HW: NDArray, limits: Limits) -> NDArray[np.bool_]:
+def evaluation_mask(true_m_HW: NDArray[Any], limits: Limits) -> NDArray[np.bool_]:
     """Pixels that count: strictly inside the range and, by `depth_crop`, one of CROPS.
 
     Raises:
@@ -49,13 +50,15 @@ def evaluation_mask(true_m_HW: NDArray, limits: Limits) -> NDArray[np.bool_]:
     return inside_HW & (true_m_HW > limits.min_depth_m) & (true_m_HW < limits.max_depth_m)
 
 
-def median_scale(predicted_HW: NDArray, true_m_HW: NDArray, mask_HW: NDArray[np.bool_]) -> float:
+def median_scale(
+    predicted_HW: NDArray[Any], true_m_HW: NDArray[Any], mask_HW: NDArray[np.bool_]
+) -> float:
     """The factor that makes the medians over the mask equal; positive predictions are needed."""
     return float(np.median(true_m_HW[mask_HW]) / np.median(predicted_HW[mask_HW]))
 
 
 def depth_errors(
-    predicted_m: NDArray, true_m: NDArray, mask: NDArray[np.bool_], limits: Limits
+    predicted_m: NDArray[Any], true_m: NDArray[Any], mask: NDArray[np.bool_], limits: Limits
 ) -> dict[str, float]:
     """Errors of one image over the mask: relative ones and deltas as fractions, rmse in metres.
 
@@ -83,7 +86,7 @@ class DepthErrors:
         self.sums = np.zeros(len(NAMES))
         self.images = self.without_truth = 0
 
-    def update(self, predicted_m_HW: NDArray, true_m_HW: NDArray) -> None:
+    def update(self, predicted_m_HW: NDArray[Any], true_m_HW: NDArray[Any]) -> None:
         """Add an image; the prediction is in metres already."""
         mask_HW = evaluation_mask(true_m_HW, self.limits)
         if mask_HW.any():

@@ -76,7 +76,8 @@ class StackEncoder(nn.Module):
 
     def forward(self, image_B3HW: Tensor, context_B23HW: Tensor) -> Tensor:
         frames = [image_B3HW, context_B23HW[:, 0], context_B23HW[:, 1]]
-        return self.resnet(torch.cat([self.normalize(frame) for frame in frames], 1))
+        found: Tensor = self.resnet(torch.cat([self.normalize(frame) for frame in frames], 1))
+        return found
 
 
 class FlowEncoder(nn.Module):
@@ -101,7 +102,8 @@ class FlowEncoder(nn.Module):
             target_B1HW = image_B3HW.float().mean(1, keepdim=True)
             context_B2HW = context_B23HW.float().mean(2)
             cells = [self._flow(target_B1HW, context_B2HW, level) for level in self.LEVELS]
-        return self.conv(torch.cat(cells, 1))
+        found: Tensor = self.conv(torch.cat(cells, 1))
+        return found
 
     def _flow(self, target_B1HW: Tensor, context_B2HW: Tensor, level: int) -> Tensor:
         """[B,6,H/8,W/8]: for both frames the shift (x, y) in cells, and how textured it is."""

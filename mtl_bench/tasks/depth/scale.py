@@ -15,9 +15,7 @@ ROAD, NORMALS, FAILED = range(3)
 GRID = 2**12  # pixels that depth scaling looks at; a larger map is subsampled
 BELOW_HORIZON = 0.25  # ground pixels are this far down between the optical axis and the last row
 MIN_GROUND = 0.005  # share of the pixels; with fewer the estimate is not tried
-MAX_TILT = math.tan(math.radians(3.5))  # of the camera to the road; Cityscapes' is up to 0.05 rad
 FLAT = math.cos(math.radians(5))  # ground by normals: nearer to vertical than this (MGNet's value)
-REWEIGHTINGS = 10
 
 
 def dgc_scale(
@@ -25,7 +23,6 @@ def dgc_scale(
     K_B33: Tensor,
     camera_height_m_B: Tensor,
     road_BHW: Tensor | None,
-    max_tilt: float = 0.0,
     pitch_rad_B: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Factor [B] from depth to metres, and where it came from [B] (an index into DGC_SOURCES).
@@ -38,9 +35,6 @@ def dgc_scale(
     Departs from the paper in the normal n. Its normals come from neighbouring pixels of each point
     and are biased by noise (5 % of noise shift the height by a tenth or more), least squares on
     n . X = 1 likewise. Here n is one for the image: straight down by the camera's calibrated pitch.
-    With `max_tilt` it is tilted further, as far as the ground's inverse depth says (linear in the
-    pixel for a plane, so that noise averages out): exact on a plane within that tilt where the
-    pitch is not known, but a prediction that bends the road pulls it off, so it is off by default.
     Only pixels well below the optical axis count (BELOW_HORIZON): near the horizon a small tilt
     changes the height many times over.
 
@@ -49,8 +43,7 @@ def dgc_scale(
         K_B33: intrinsics in pixels of that map.
         camera_height_m_B: above the road.
         road_BHW: bool, predicted; None without a panoptic task.
-        max_tilt: tangent of the largest pitch and roll to look for; 0 = none; try MAX_TILT.
-        pitch_rad_B: the calibrated pitch to start from, positive looks down; None = level.
+        pitch_rad_B: the calibrated pitch, positive looks down; None = level.
     """
     step = math.ceil(math.sqrt(depth_B1HW.shape[2] * depth_B1HW.shape[3] / GRID))
     # ONNX Runtime lacks some operators in double precision
@@ -75,7 +68,7 @@ def dgc_scale(
         pitch_B11 = pitch_rad_B.to(depth_BHW)[:, None, None]
     down_BHW = ray_y_BHW * pitch_B11.cos() + pitch_B11.sin()
     ground_BHW = ground_BHW & (down_BHW > 0)
-    height_B = _height(depth_BHW, ray_x_BHW, down_BHW, ground_BHW, max_tilt, pitch_B11[:, :, 0])
+    height_B = _height(depth_BHW, down_BHW, ground_BHW)
     source_B = torch.where(has_road_B, ROAD, torch.where(has_flat_B, NORMALS, FAILED))
     source_B = torch.where((height_B > 0) & height_B.isfinite(), source_B, FAILED)
     scale_B = camera_height_m_B.to(dtype) / height_B
@@ -92,14 +85,7 @@ def _rays(depth_BHW: Tensor, K_B33: Tensor, step: int) -> tuple[Tensor, Tensor]:
     return ray_x_BHW.expand_as(depth_BHW), ray_y_BHW.expand_as(depth_BHW)
 
 
-def _height(
-    depth_BHW: Tensor,
-    ray_x_BHW: Tensor,
-    down_BHW: Tensor,
-    ground_BHW: Tensor,
-    max_tilt: float,
-    pitch_B1: Tensor,
-) -> Tensor:
+def _height(depth_BHW: Tensor, down_BHW: Tensor, ground_BHW: Tensor) -> Tensor:
     """Median height [B] of the camera above the ground pixels; NaN without any.
 
     `down` is the ray's part along g, straight down for a camera of the calibrated pitch.
@@ -108,13 +94,7 @@ def _height(
     ground_BP = ground_BHW.reshape(flat)
     down_BP = torch.where(ground_BP, down_BHW.reshape(flat), 1)
     depth_BP = torch.where(ground_BP, depth_BHW.reshape(flat), torch.inf)
-    median_B = _median(depth_BP * down_BP, ground_BP)  # the height, were there no tilt
-    if max_tilt == 0:
-        return median_B
-    x_BP = torch.where(ground_BP, ray_x_BHW.reshape(flat), 0)
-    p_B1, q_B1 = _tilt(depth_BP * down_BP / median_B[:, None], x_BP, down_BP, ground_BP, max_tilt)
-    length_B1 = (1 + p_B1**2 + q_B1**2 + 2 * q_B1 * pitch_B1.sin()).sqrt()
-    return _median(depth_BP * (p_B1 * x_BP + down_BP + q_B1) / length_B1, ground_BP)
+    return _median(depth_BP * down_BP, ground_BP)
 
 
 def _median(value_BP: Tensor, counts_BP: Tensor) -> Tensor:
@@ -125,36 +105,6 @@ def _median(value_BP: Tensor, counts_BP: Tensor) -> Tensor:
     count_B1 = counts_BP.sum(1, keepdim=True)
     median_B1 = value_BP.sort(1).values.gather(1, (count_B1 - 1).clamp(min=0) // 2)
     return torch.where(count_B1 > 0, median_B1, torch.nan)[:, 0]
-
-
-def _tilt(
-    level_BP: Tensor, x_BP: Tensor, down_BP: Tensor, ground_BP: Tensor, max_tilt: float
-) -> tuple[Tensor, Tensor]:
-    """Tangents p and q [B,1] of the ground's roll and pitch against g.
-
-    With n = (g + p x + q z) / |.| a plane has 1 / (depth * down) = c (1 + p ray_x / down + q /
-    down): a regression whose noise is alike everywhere. Least absolute deviations, by reweighting.
-    `level` is depth * down in units of its median, which scales the regression.
-    """
-    inverse_BP = torch.nan_to_num(1 / level_BP)
-    basis_B3P = torch.stack([torch.ones_like(x_BP), x_BP / down_BP, 1 / down_BP], 1)
-    basis_B3P = basis_B3P * ground_BP[:, None]
-    weight_BP = ground_BP.to(level_BP)
-    ridge = 1e-12 * torch.eye(3, device=x_BP.device, dtype=x_BP.dtype)
-    for _ in range(REWEIGHTINGS):
-        weighted_B3P = basis_B3P * weight_BP[:, None]
-        normal_B33 = weighted_B3P @ basis_B3P.mT
-        right_B31 = weighted_B3P @ inverse_BP[:, :, None]
-        damping = ridge * normal_B33.diagonal(dim1=1, dim2=2).clamp(min=1e-9)[:, None]
-        solution_B31 = torch.linalg.solve_ex(normal_B33 + damping, right_B31).result
-        residual_BP = (inverse_BP - (basis_B3P * solution_B31).sum(1)).abs()
-        weight_BP = ground_BP / residual_BP.clamp(min=1e-4)
-
-    slope_B, tilt_x_B, tilt_z_B = solution_B31.squeeze(2).unbind(1)
-    sound_B = slope_B > 0.1  # of about 1; otherwise there is no ground in this depth: no tilt
-    p_B = torch.where(sound_B, tilt_x_B / slope_B, 0).clamp(-max_tilt, max_tilt)
-    q_B = torch.where(sound_B, tilt_z_B / slope_B, 0).clamp(-max_tilt, max_tilt)
-    return p_B[:, None], q_B[:, None]
 
 
 def _horizontal(depth_BHW: Tensor, ray_x_BHW: Tensor, ray_y_BHW: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ Source: MGNet (Schoen, Buchholz, Dietmayer, ICCV 2021) after Panoptic-DeepLab (C
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,6 +26,7 @@ from mtl_bench.tasks.panoptic import grouping, pseudo_labels
 from mtl_bench.tasks.panoptic.files import write_panoptic
 from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_loss
 from mtl_bench.tasks.panoptic.metrics import PanopticQuality, SemanticIoU
+from mtl_bench.tasks.panoptic.picture import PanopticView
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 from mtl_bench.tasks.pixels import sampled
 
@@ -84,6 +86,27 @@ class Panoptic(Task):
         Column("pq_stuff", "panoptic.pq_stuff", "PQ stuff", +1, 1, "%"),
         Column("miou", "semantic.miou", "mIoU", +1, 1, "%", in_delta=True, short=True),
     )
+    files = ("overlay", "ids")
+    drawn: ClassVar[Mapping[str, str]] = {"instance_ids": "panoptic maps"}
+    agreement = (
+        Column(
+            *("panoptic_equal", "agreement.panoptic_equal", "panoptic", +1, 3, "% equal"),
+            scale=100,
+            short=True,
+            words="panoptic pixels that are equal",
+        ),
+        Column(
+            *("logits_max", "agreement.logits_max", "logits", -1, 0, "max diff."),
+            scientific=True,
+            words="logits absolute",
+        ),
+    )
+    words: ClassVar[Mapping[str, str]] = {
+        "trivial": "most frequent class per pixel",
+        "timed": "panoptic map",
+        "random": "the number of instances that post-processing finds, and its time, may be "
+        "another, and nearly tied logits make equal panoptic pixels say less",
+    }
 
     # --- network ----------------------------------------------------------------------------------
 
@@ -207,6 +230,29 @@ class Panoptic(Task):
     def trivial(self, size: Size) -> Trivial:
         return MostFrequentClass(self.labels, self.recipe, size)
 
+    # --- for a viewer -----------------------------------------------------------------------------
+
+    def at_size(self, size: Size) -> "Panoptic":
+        data, ev = self.recipe.data, self.recipe.evaluate
+        times = (size[0] * size[1] / (data.height * data.width)) ** 0.5
+        kernel = max(3, 2 * round((ev.nms_kernel * times - 1) / 2) + 1)
+        scaled = replace(ev, nms_kernel=kernel, stuff_area=round(ev.stuff_area * times**2))
+        return Panoptic(replace(self.recipe, evaluate=scaled), self.labels)
+
+    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> PanopticView:
+        """Metrics see no class that is not evaluated, a viewer does: its bare label id."""
+        found = {name: value[0].cpu() for name, value in results[self.name].items()}
+        ids_HW = grouping.to_instance_ids(found["panoptic"], self.labels).numpy()
+        class_HW = found["class"].numpy()
+        unevaluated = [i for i in range(len(self.labels)) if i not in self.labels.evaluated]
+        bare_HW = self.labels.label_id_of_class()[class_HW]
+        shown_HW = np.where(np.isin(class_HW, unevaluated), bare_HW, ids_HW)
+        return PanopticView(shown_HW.astype(np.int32), self.labels)
+
+    @classmethod
+    def drawn_view(cls, name: str, map_HW: NDArray[Any], labels: LabelSet) -> PanopticView:
+        return PanopticView(np.asarray(map_HW, np.int32), labels)
+
 
 class PanopticMetric(Metric):
     """Panoptic quality and semantic IoU of the frames that have labels, in percent."""
@@ -269,7 +315,8 @@ class MostFrequentClass(Trivial):
         """IGNORE where no class was ever seen; ties go to the lowest."""
         most_HW = self.votes.argmax(0).astype(np.uint8)
         most_HW[self.votes.max(0) == 0] = IGNORE
-        return most_HW
+        found: NDArray[np.uint8] = most_HW
+        return found
 
     def result(self, count: int, size: Size) -> Results:
         class_BHW = torch.from_numpy(sampled(self.class_HW(), size)).expand(count, -1, -1)

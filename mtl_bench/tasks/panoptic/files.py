@@ -9,6 +9,7 @@ whose pixels hold segment ids as R + 256 G + 65536 B:
 import json
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from mtl_bench.core.files import write_text
 from mtl_bench.core.labels import DIVISOR
 
 
-def write_panoptic(out: Path, split: str, frames: Iterable[tuple[str, NDArray]]) -> Path:
+def write_panoptic(out: Path, split: str, frames: Iterable[tuple[str, NDArray[Any]]]) -> Path:
     """Write (city_sequence_frame, map [H,W] of instance ids) pairs; returns the JSON file."""
     base = out / f"cityscapes_panoptic_{split}"
     base.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ Shapes: T true segments, P predicted ones, C classes.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,7 @@ def match(predicted: Segments, true: Segments, classes: int) -> Tally:
     )
 
 
-def segments(ids_HW: NDArray, labels: LabelSet) -> Segments:
+def segments(ids_HW: NDArray[Any], labels: LabelSet) -> Segments:
     """Segments of a map of Cityscapes' instance ids; a true thing's bare label id is a crowd."""
     ids, index_HW = np.unique(ids_HW, return_inverse=True)
     classes = class_of_instance_id(labels)[ids].astype(np.int64)
@@ -115,7 +116,7 @@ class PanopticQuality:
         self.labels = labels
         self.tally = Tally.zero(IGNORE)
 
-    def update(self, predicted_ids_HW: NDArray, true_ids_HW: NDArray) -> Tally:
+    def update(self, predicted_ids_HW: NDArray[Any], true_ids_HW: NDArray[Any]) -> Tally:
         """Add an image: maps of Cityscapes' instance ids (labelId, or labelId * 1000 + number).
 
         Returns:
@@ -126,7 +127,7 @@ class PanopticQuality:
         self.tally += own
         return own
 
-    def compute(self) -> dict:
+    def compute(self) -> dict[str, Any]:
         """pq, sq, rq, then pq_things and pq_stuff, and per class the three with tp, fp and fn.
 
         A class that occurs nowhere is in no mean nor in `per_class`; a mean over nothing is NaN.
@@ -139,7 +140,9 @@ class PanopticQuality:
 
         things = tuple(i for i in self.labels.evaluated if i in self.labels.things)
         stuff = tuple(i for i in self.labels.evaluated if i not in self.labels.things)
-        result: dict = dict(zip(("pq", "sq", "rq"), mean(self.labels.evaluated), strict=True))
+        result: dict[str, Any] = dict(
+            zip(("pq", "sq", "rq"), mean(self.labels.evaluated), strict=True)
+        )
         result["pq_things"], result["pq_stuff"] = mean(things)[0], mean(stuff)[0]
         result["per_class"] = {
             self.labels.labels[i].name: {
@@ -165,14 +168,14 @@ class SemanticIoU:
         self.labels = labels
         self.confusion = np.zeros((IGNORE + 1, IGNORE + 1), np.int64)  # true, predicted
 
-    def update(self, predicted_class_HW: NDArray, true_class_HW: NDArray) -> None:
+    def update(self, predicted_class_HW: NDArray[Any], true_class_HW: NDArray[Any]) -> None:
         """Add an image: maps of class indices, IGNORE where there is none."""
         pairs = true_class_HW.astype(np.int64) * (IGNORE + 1) + predicted_class_HW
         self.confusion += np.bincount(pairs.ravel(), minlength=self.confusion.size).reshape(
             self.confusion.shape
         )
 
-    def compute(self) -> dict:
+    def compute(self) -> dict[str, Any]:
         """miou, and the IoU per class; a class that occurs nowhere is in neither."""
         evaluated = list(self.labels.evaluated)
         true = self.confusion[evaluated]

@@ -7,6 +7,7 @@ pixels do not count in the center loss.
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -92,13 +93,14 @@ def panoptic_targets(
     )
 
 
-def _draw(values: NDArray, segment_HW: NDArray, kind: type = np.float32) -> NDArray:
+def _draw(values: NDArray[Any], segment_HW: NDArray[Any], kind: type = np.float32) -> NDArray[Any]:
     """A picture of the segments' values; OpenCV's look-up is faster, but knows bytes alone."""
     if segment_HW.dtype != np.uint8:
-        return values.astype(kind)[segment_HW]
-    table: NDArray = np.zeros(_BYTE, kind)
+        found: NDArray[Any] = values.astype(kind)[segment_HW]
+        return found
+    table: NDArray[Any] = np.zeros(_BYTE, kind)
     table[: len(values)] = values
-    return cv2.LUT(segment_HW, table)
+    return np.asarray(cv2.LUT(segment_HW, table))
 
 
 def _heat_map(

@@ -1,19 +1,20 @@
 """Panoptic maps: class colours with a shade an instance and outlines, over the gray image."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core import canvas
+from mtl_bench.core.canvas import VOID, Image
 from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet, class_of_instance_id
-from mtl_bench.show.render import canvas
-from mtl_bench.show.render.canvas import Image
+from mtl_bench.core.view import Key, Segments, View
 
 STRENGTH = 0.65  # of the colours over the image
 SHADES = (0.0, 0.45, -0.35, 0.25, 0.6, -0.15)  # towards white, or below 0 towards black
-VOID = (120, 120, 120)  # colour of what has no class, where there is no image beneath
 
 
 def segment_colors(instance_ids: NDArray[np.integer[Any]], labels: LabelSet) -> Image:
@@ -70,22 +71,45 @@ def legend(labels: LabelSet, width: int, shown: Collection[int] | None = None) -
     return picture
 
 
-def panoptic_picture(
-    image_HW3: Image,
-    instance_ids_HW: NDArray[np.integer[Any]],
-    labels: LabelSet,
-    whole_legend: bool = False,
-) -> Image:
-    """The overlay, enlarged where it is tiny, above the legend.
+@dataclass(frozen=True)
+class PanopticView(Segments):
+    """A panoptic map."""
 
-    Args:
-        whole_legend: with every class, so that all frames of a video have one; else with those in
-            the image.
-    """
-    times = canvas.factor(image_HW3.shape[1])
-    image = canvas.enlarge(image_HW3, times, smooth=True)
-    ids = canvas.enlarge(instance_ids_HW.astype(np.int32), times)
-    shown = None
-    if not whole_legend:
-        shown = set(np.unique(class_of_instance_id(labels)[instance_ids_HW]).tolist())
-    return canvas.stack([overlay(image, ids, labels), legend(labels, image.shape[1], shown)])
+    task = "panoptic"
+
+    @property
+    def class_HW(self) -> NDArray[np.uint8]:
+        """Class indices, IGNORE where void."""
+        return class_of_instance_id(self.labels)[self.ids_HW]
+
+    def picture(self, image_HW3: Image) -> Image:
+        return overlay(image_HW3, canvas.nearest(self.ids_HW, image_HW3), self.labels)
+
+    def explained(self, image_HW3: Image, whole: bool = False) -> Image:
+        """The overlay above the legend: with every class, or with those in the image."""
+        times = canvas.factor(image_HW3.shape[1])
+        image = canvas.enlarge(image_HW3, times, smooth=True)
+        ids = canvas.enlarge(self.ids_HW.astype(np.int32), times)
+        shown = None if whole else set(np.unique(self.class_HW).tolist())
+        below = legend(self.labels, image.shape[1], shown)
+        return canvas.stack([overlay(image, ids, self.labels), below])
+
+    def files(self, kind: str, image_HW3: Image) -> dict[str, NDArray[Any]]:
+        """`overlay` with a legend; `instanceIds`, 16 bits."""
+        if kind == "overlay":
+            return {"overlay": self.explained(image_HW3)}
+        return {"instanceIds": self.ids_HW.astype(np.uint16)} if kind == "ids" else {}
+
+    @classmethod
+    def key(cls, views: Sequence[View]) -> Key:
+        """The classes in the maps, in the label set's order."""
+        shown = [view for view in views if isinstance(view, cls)]
+        known = dict.fromkeys(label for view in shown for label in view.labels.labels)
+        present = {
+            view.labels.labels[index]
+            for view in shown
+            for index in np.unique(view.class_HW).tolist()
+            if index != IGNORE
+        }
+        swatches = {label.name: label.color for label in known if label in present}
+        return Key("Panoptic segmentation", swatches)

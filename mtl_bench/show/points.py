@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench.show.render.canvas import Image
+from mtl_bench.core.canvas import Image
 
 OVERSAMPLING = 2  # per axis: smooth edges
 LARGEST = 15  # pixels of a point's square, before the picture is shrunk
