@@ -10,10 +10,9 @@ import pytest
 from test_report import Page
 from typer.testing import CliRunner
 
-from mtl_bench.bench import store
-from mtl_bench.core.files import write_json
 from mtl_bench.cli.app import app
 from mtl_bench.core import config
+from mtl_bench.core.files import write_json
 from mtl_bench.report import literature
 from mtl_bench.report import table as formats
 from mtl_bench.report.statistics import SMOKE

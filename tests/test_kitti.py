@@ -32,10 +32,9 @@ from kitti_tree import (
 from typer.testing import CliRunner
 
 from mtl_bench.bench import store
-from mtl_bench.core import locks
 from mtl_bench.bench.run import run_cell
 from mtl_bench.cli.app import app
-from mtl_bench.core import config
+from mtl_bench.core import config, locks
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.task import tasks_of_cell

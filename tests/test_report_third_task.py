@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from fake_rows import GRID, make_row, write_runs
 
-from mtl_bench.bench import store
 from mtl_bench.bench.jobs import CELLS
 from mtl_bench.core import config, plugins, quality
 from mtl_bench.core.columns import Column
