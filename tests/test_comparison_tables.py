@@ -10,9 +10,9 @@ import pytest
 from test_report import Page
 from typer.testing import CliRunner
 
-from mtl_bench.bench import results
 from mtl_bench.cli.app import app
 from mtl_bench.core import config
+from mtl_bench.core.files import write_json
 from mtl_bench.report import literature
 from mtl_bench.report import table as formats
 from mtl_bench.report.statistics import SMOKE
@@ -356,8 +356,8 @@ def runs(tmp_path):
         folder = tmp_path / "runs" / made.slug
         folder.mkdir(parents=True)
         own = row("synthetic", made.seed, method="fixed", backbone="tiny", smoke=made.recipe.smoke)
-        results.write_json(folder / "cell.json", config.to_dict(made))
-        results.write_json(folder / "row.json", own)
+        write_json(folder / "cell.json", config.to_dict(made))
+        write_json(folder / "row.json", own)
     (tmp_path / "runs/begun").mkdir()
     return tmp_path / "runs"
 

@@ -8,8 +8,9 @@ import torch
 from small_networks import SIZE, subject
 from typer.testing import CliRunner
 
-from mtl_bench.bench import latency_grid, scaffold, timing
+from mtl_bench.bench import jobs, scaffold
 from mtl_bench.bench.check import check
+from mtl_bench.bench.grid import load_grid
 from mtl_bench.cli.app import app
 from mtl_bench.core import plugins
 from mtl_bench.core.engine import Engine, Setting
@@ -179,14 +180,14 @@ def test_a_grid_takes_a_users_engine_and_skips_what_it_lacks(put, tmp_path):
     axes = 'backbone = ["tiny"]\nsize = ["64x128"]\ntasks = [["depth"]]\n'
     axes += 'engine = ["plain", "myengine"]\nprecision = ["fp32", "bf16"]\n'
     (tmp_path / "g.toml").write_text(f'kind = "latency"\nquestion = "?"\n\n[axes]\n{axes}')
-    grid = latency_grid.load("g.toml")
-    timing.check(grid.timings)
-    assert [(t.engine, t.precision) for t in grid.timings] == [
+    grid = load_grid("g.toml")
+    jobs.TIMINGS.check(grid.jobs)
+    assert [(t.engine, t.precision) for t in grid.jobs] == [
         ("plain", "fp32"),
         ("myengine", "fp32"),
     ]
     assert "myengine has no bf16 on cpu" in {skip.why for skip in grid.skips}
-    assert timing.lack(grid.timings[1]) is None
+    assert jobs.lack(grid.jobs[1]) is None
 
 
 def test_named_maps_are_those_of_the_contract():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from kitti_tree import write_tree
-from mtl_bench.bench.results import write_json
 from test_cloud_page import shown
 from typer.testing import CliRunner
 
@@ -16,6 +15,7 @@ from mtl_bench.cli.app import app
 from mtl_bench.core import canvas
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.device import Engine
+from mtl_bench.core.files import write_json
 from mtl_bench.core.plugins import PACKAGE
 from mtl_bench.core.view import Key, View
 from mtl_bench.show import figures

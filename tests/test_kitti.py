@@ -31,10 +31,10 @@ from kitti_tree import (
 )
 from typer.testing import CliRunner
 
-from mtl_bench.bench import claim, results
+from mtl_bench.bench import store
 from mtl_bench.bench.run import run_cell
 from mtl_bench.cli.app import app
-from mtl_bench.core import config
+from mtl_bench.core import config, locks
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.task import tasks_of_cell
@@ -557,8 +557,8 @@ def cell_of(recipe="kitti-smoke", tasks=(), dataset="kitti", **data):
 
 
 def execute(cell, runs, root):
-    with claim.claim(results.run_dir(cell, runs)):
-        directory, _ = results.begin(cell, runs)
+    with locks.claim(store.run_dir(cell, runs)):
+        directory, _ = store.begin(cell, runs)
         return run_cell(cell, directory, root, "cpu", echo=lambda line: None)
 
 
@@ -568,7 +568,7 @@ def teacher(smoke_root, tmp_path_factory):
     cell = Cell(load_recipe("smoke"), "tiny", "fixed_uncertainty", tasks=("panoptic",))
     runs = tmp_path_factory.mktemp("teacher")
     execute(cell, runs, smoke_root)
-    return results.run_dir(cell, runs)
+    return store.run_dir(cell, runs)
 
 
 def test_a_cityscapes_cell_labels_kitti(tree, teacher):

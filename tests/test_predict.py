@@ -17,9 +17,9 @@ from conftest import SHARED
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench.bench import results
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Cell, load_recipe, to_dict
+from mtl_bench.core.files import write_json
 from mtl_bench.core.geometry import scale_intrinsics
 from mtl_bench.core.labels import IGNORE
 from mtl_bench.core.task import tasks_of, tasks_of_cell
@@ -298,7 +298,7 @@ def test_a_folder_is_whole_or_not_there(tmp_path):
 def write_run(folder, cell, labels=CITYSCAPES20):
     torch.manual_seed(0)
     folder.mkdir()
-    results.write_json(folder / "cell.json", to_dict(cell))
+    write_json(folder / "cell.json", to_dict(cell))
     tasks = tasks_of(cell.recipe, cell.tasks, labels)
     state = {"format": 1, "model": build_model(cell, tasks).state_dict()}
     torch.save(state, folder / "last.pt")

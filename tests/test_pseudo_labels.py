@@ -15,10 +15,10 @@ from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench.bench import results
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Augment, Cell, Data, Evaluate, Loss, Network, PseudoLabels, Recipe
 from mtl_bench.core.dataset import dataset_of
+from mtl_bench.core.files import write_json
 from mtl_bench.core.labels import IGNORE, class_of_instance_id
 from mtl_bench.core.plain import to_dict
 from mtl_bench.core.task import tasks_of, tasks_of_cell
@@ -571,7 +571,7 @@ def run_of(cell, directory):
     data = replace(cell.recipe.data, height=HEIGHT // 2, width=WIDTH // 2)
     cell = with_recipe(cell, data=data)
     directory.mkdir()
-    results.write_json(directory / "cell.json", to_dict(cell))
+    write_json(directory / "cell.json", to_dict(cell))
     torch.manual_seed(0)
     state = {
         "format": checkpoint.FORMAT,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fake_rows import GRID, make_row, write_runs
 
-from mtl_bench.bench import results
+from mtl_bench.bench.jobs import CELLS
 from mtl_bench.core import config, plugins, quality
 from mtl_bench.core.columns import Column
 from mtl_bench.report import delta, grid, latency, readme
@@ -161,7 +161,7 @@ def test_one_task_alone_has_no_delta():
 
 def test_headline_readme_and_latency(tmp_path):
     metric = {"normals.mean_angle": 20.0, "panoptic.pq": 30.0, "latency.fps": 5.0}
-    assert results.headline(metric) == "PQ 30.0  mean angle 20.0  FPS 5.0"
+    assert CELLS.headline(metric) == "PQ 30.0  mean angle 20.0  FPS 5.0"
     assert grid.Layout().pictures == ("pq_fps", "rmse_fps", "mean_angle_fps")
     assert "mean_angle_fps" in grid.Layout.of({"readme": ["mean_angle_fps"]}).pictures
     trained = [{**row, "tasks": row["cell"]["tasks"]} for row in rows()]

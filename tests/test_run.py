@@ -13,7 +13,9 @@ from mtl_bench.bench.run import run_cell
 from mtl_bench.bench.stored import load_model, reevaluate
 from mtl_bench.cli.app import app
 from mtl_bench.core.config import Cell, load_recipe, to_dict
-from mtl_bench.data import pseudo_frames
+from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.data.loader import open_dataset
+from mtl_bench.evaluate import pseudo_frames
 from mtl_bench.train import checkpoint
 from mtl_bench.train.progress import Interrupted
 
@@ -137,13 +139,13 @@ def test_it_trains_on_both_kinds_of_labels(cells, finished, smoke_root, tmp_path
     from mtl_bench.train import loop as train
 
     copy_parent(cells, finished, tmp_path)
-    opened, open_samples = [], train.open_samples
+    opened, open_dataset = [], train.open_dataset
 
     def spy(*given, **settings):
-        opened.append(open_samples(*given, **settings))
+        opened.append(open_dataset(*given, **settings))
         return opened[-1]
 
-    monkeypatch.setattr(train, "open_samples", spy)
+    monkeypatch.setattr(train, "open_dataset", spy)
     row = execute(cells["video"], tmp_path, smoke_root)
     human = cells["video"].recipe.data.train_scenes
     assert [len(dataset) for dataset in opened] == [human + row["protocol"]["pseudo_frames"]]
@@ -253,13 +255,11 @@ def test_side_by_side_gives_each_networks_outputs(cells, finished):
         for name in ("apart", "panoptic", "depth")
     )
     image = torch.rand(2, 3, 32, 64)
-    both, first, second = (model.net(image).maps for model in (apart, panoptic, depth))
-    assert set(both["panoptic"]) == {"semantic", "center", "offset"}
-    assert set(both["depth"]) == {"inverse"}
-    for task, alone in (("panoptic", first), ("depth", second)):
-        for name, map_ in both[task].items():
-            assert torch.equal(map_, alone[task][name])
-    assert list(dict(apart.named_children())) == ["net"]  # no pose network
+    both, first, second = (model.net(image) for model in (apart, panoptic, depth))
+    for name in ("semantic_BCHW", "center_B1HW", "offset_B2HW"):
+        assert torch.equal(getattr(both, name), getattr(first, name))
+    assert torch.equal(both.inverse_depth[0], second.inverse_depth[0])
+    assert apart.pose is None
 
 
 # --- only what changed code concerns ---
@@ -341,11 +341,19 @@ def test_and_otherwise_it_is_stale_for_training(together, rows):
 @pytest.mark.parametrize("name", ["together", "apart"])
 def test_latency_alone_can_be_taken_again(name, cells, finished, rows, smoke_root, monkeypatch):
     cell, before = cells[name], rows[name]
-    monkeypatch.setattr("mtl_bench.bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
+    seen = []
+    monkeypatch.setattr(
+        "mtl_bench.bench.stored.measure",
+        lambda *given: seen.append(given) or {"latency.mean_ms": 12.5},
+    )
     arguments = [str(finished / cell.slug / "cell.json"), "--latency", "--runs", str(finished)]
     done = CliRunner().invoke(app, ["train", *arguments, "--data", str(smoke_root)])
     assert done.exit_code == 0, done.output
     assert "12.5 ms a frame" in done.output
+    dataset = open_dataset(cell, cell.recipe.evaluate.split, smoke_root, training=False)
+    pitch_rad = float(dataset.sample(0, None).camera_pitch_rad_B)
+    assert pitch_rad != 0
+    assert seen[0][-2:] == (CITYSCAPES20.index("road"), pitch_rad)
     after = results.load_row(finished / cell.slug)
     assert after["metric"] == before["metric"] | {"latency.mean_ms": 12.5}
     assert after["time"].keys() == before["time"].keys()

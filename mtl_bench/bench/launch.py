@@ -188,6 +188,7 @@ class TimingRun(Run):
 
     def settled(self, state: State) -> State | None:
         self._code = kind_of(self.job).code(self.job)
+        self.began = time.monotonic()
         why = self.lack(self.job)
         return None if why is None else self._keep({"status": "unavailable", "why": why})
 
