@@ -24,7 +24,7 @@ from mtl_bench.core import config, fingerprint, locks
 from mtl_bench.core.files import write_json
 from mtl_bench.deploy import engines
 
-FAKE = Path(__file__).with_name("fake_timing.py")
+FAKE = Path(__file__).parents[1] / "support" / "fake_timing.py"
 GRID = """kind = "latency"
 question = "How fast?"
 

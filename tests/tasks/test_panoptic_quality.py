@@ -23,7 +23,7 @@ from mtl_bench.tasks.panoptic.metrics import (
     match,
 )
 
-PUBLISHED = Path(__file__).parents[2] / "shared/data/deeplab2_testdata/evaluation"
+PUBLISHED = Path(__file__).parents[3] / "shared/data/deeplab2_testdata/evaluation"
 
 
 def random_truth(rng, height=48, width=96):

@@ -13,7 +13,7 @@ from mtl_bench.bench.check import check
 from mtl_bench.bench.grid import load_grid
 from mtl_bench.report import readme
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+README = Path(__file__).resolve().parents[2] / "README.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
 
 

@@ -17,7 +17,7 @@ from mtl_bench.cli.display import Lines
 from mtl_bench.core import locks, provenance
 from mtl_bench.core.config import Cell, Recipe
 
-FAKE = Path(__file__).with_name("fake_cell.py")
+FAKE = Path(__file__).parents[1] / "support" / "fake_cell.py"
 
 
 def cells(count):

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from mtl_bench.cli.app import app
 from mtl_bench.core import cards, plugins
 
-FOLDER = Path(__file__).resolve().parents[1] / "methods"
+FOLDER = Path(__file__).resolve().parents[2] / "methods"
 SHIPPED = sorted(FOLDER.glob("[!_]*.py"))
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from mtl_bench.bench.results import write_json
+from mtl_bench.core.files import write_json
 
 from mtl_bench.core.config import Optim, to_dict
 from mtl_bench.core.device import Engine, choose_device, seed_for

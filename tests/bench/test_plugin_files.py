@@ -14,7 +14,7 @@ from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.quality import columns_of, quality
 
-FOLDER = Path(__file__).parent / "plugins"
+FOLDER = Path(__file__).parents[1] / "plugins"
 PLUGINS = [
     ("tasks", "normals"),
     ("tasks", "depth_silog"),

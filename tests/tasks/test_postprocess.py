@@ -153,7 +153,7 @@ def test_members_may_be_any_classes():
 
 
 def load_benchmark():
-    path = Path(__file__).parents[1] / "benchmarks" / "postprocess.py"
+    path = Path(__file__).parents[2] / "benchmarks" / "postprocess.py"
     spec = importlib.util.spec_from_file_location("benchmark_of_postprocess", path)
     assert spec is not None
     assert spec.loader is not None
