@@ -5,22 +5,23 @@ import functools
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.core import config
+from mtl_bench.core.batch import Camera
 from mtl_bench.core.config import Cell, load_recipe
-from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.deploy.maps import Camera
+from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.deploy.subject import Subject
 from mtl_bench.model import Model, build_model
 
 SIZE = (64, 128)
+TASKS = load_recipe("smoke").tasks
 
 
 @functools.cache
-def model(backbone: str = "tiny", tasks: tuple[str, ...] = config.TASKS) -> Model:
+def model(backbone: str = "tiny", tasks: tuple[str, ...] = TASKS) -> Model:
     """Statistics, factors and shifts of batch normalisations are drawn, so that they matter; the
     heads are strong enough for clear classes and a few centers."""
     torch.manual_seed(0)
-    found = build_model(Cell(load_recipe("smoke"), backbone, "", tasks), CITYSCAPES20)
+    cell = Cell(load_recipe("smoke"), backbone, "", tasks)
+    found = build_model(cell, tasks_of_cell(cell))
     for module in found.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.running_mean.normal_(0, 0.3)
@@ -41,18 +42,14 @@ def images(count: int, size: tuple[int, int] = SIZE) -> list[Tensor]:
     return list((fine * 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous().split(1))
 
 
-def subject(
-    backbone: str = "tiny", tasks: tuple[str, ...] = config.TASKS, count: int = 3
-) -> Subject:
+def subject(backbone: str = "tiny", tasks: tuple[str, ...] = TASKS, count: int = 3) -> Subject:
     K_133 = torch.tensor([[[115.0, 0, 63.5], [0, 115, 31.5], [0, 0, 1]]])
+    found = model(backbone, tasks)
     return Subject(
-        net=model(backbone, tasks).net,
+        net=found.net,
         backbone=backbone,
-        tasks=tasks,
+        tasks=found.tasks,
         images=images(count),
         camera=Camera(K_133, torch.tensor([1.4]), torch.zeros(1)),
-        things=CITYSCAPES20.things,
-        road=CITYSCAPES20.index("road"),
-        evaluate=load_recipe("smoke").evaluate,
         trained=None,
     )

@@ -104,7 +104,7 @@ def test_new_in_a_folder_and_check_by_file(tmp_path):
 def test_check_of_something_else(tmp_path):
     assert "did you mean 'fixed'" in one_line("check", "fixd")
     (tmp_path / "x.py").write_text("x = 1\n")
-    assert "is neither" in one_line("check", "x.py")
+    assert "is none: a plug-in imports" in one_line("check", "x.py")
     assert "no plug-in folder or file" in one_line("check", "gone.py")
 
 

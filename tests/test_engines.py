@@ -13,13 +13,16 @@ import torch.nn.functional as F
 from small_networks import SIZE, images, model, subject
 from torch import Tensor, nn
 
-from mtl_bench.core import config
 from mtl_bench.core.engine import Setting
+from mtl_bench.core.recipe import Recipe
 from mtl_bench.deploy import agreement, engines, roofline, timer
 from mtl_bench.deploy.graph import NORM, Body, Upsample, fold, strided
-from mtl_bench.deploy.maps import Maps
+from mtl_bench.deploy.maps import Maps, infos
 
 CPU = torch.device("cpu")
+TASKS = Recipe.tasks
+CLASSES = "panoptic.semantic.class"
+MAPS = ("panoptic.semantic", "panoptic.center", "panoptic.offset", "depth.inverse")
 PLAN = timer.Plan(passes=4, seconds=None, batch=2, threads=1, compared=2)
 Eager = engines.load("eager")
 HERE = [n for n in engines.names() if n != "tensorrt" and engines.available(n) is None]
@@ -110,13 +113,13 @@ def test_chunks_leave_no_trace(monkeypatch):
 # --- engines --------------------------------------------------------------------------------------
 
 
-AGREE = [(n, config.TASKS) for n in HERE if n != "compile"]
+AGREE = [(n, TASKS) for n in HERE if n != "compile"]
 AGREE += [("plain", ("depth",)), ("eager", ("depth",)), ("eager", ("panoptic",))]
 
 
 @pytest.mark.parametrize(("name", "tasks"), AGREE)
 def test_an_engine_agrees_with_plain(name, tasks):
-    what = subject("resnet18" if tasks == config.TASKS else "tiny", tasks)
+    what = subject("resnet18" if tasks == TASKS else "tiny", tasks)
     with torch.inference_mode():
         found = timer.compare(what, timer.make(what, name, setting()), images=2)
     assert found.wrong("fp32") == ""
@@ -140,8 +143,10 @@ def test_a_batch_is_its_images(name):
         batch = two.run(two.transfer(torch.cat(what.images[:2])))
         for number, image in enumerate(what.images[:2]):
             single = one.run(one.transfer(image))
-            assert torch.equal(batch["class"][number], single["class"][0])
-            assert torch.allclose(batch["inverse"][number], single["inverse"][0], atol=1e-4)
+            assert torch.equal(batch[CLASSES][number], single[CLASSES][0])
+            assert torch.allclose(
+                batch["depth.inverse"][number], single["depth.inverse"][0], atol=1e-4
+            )
 
 
 def test_bf16_is_another_precision():
@@ -172,7 +177,7 @@ def test_a_precision_that_an_engine_lacks_says_what_it_has():
 class Wrong(Eager):
     """Fast and wrong: what it says of one map is changed."""
 
-    change = ("inverse", 1.01)
+    change = ("depth.inverse", 1.01)
 
     def strided(self, image: Tensor) -> dict[str, Tensor]:
         maps = super().strided(image)
@@ -183,10 +188,10 @@ class Wrong(Eager):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (("inverse", 1.01), "median relative depth difference 0.0099 .limit 0.001."),
-        (("inverse", float("nan")), "depth difference inf"),
-        (("offset", 1.01), "maps 0.0[0-9]+ of their deviation .limit 0.001."),
-        (("logits", float("nan")), "not finite"),
+        (("depth.inverse", 1.01), "median relative depth difference 0.0099 .limit 0.001."),
+        (("depth.inverse", float("nan")), "depth difference inf"),
+        (("panoptic.offset", 1.01), "maps 0.0[0-9]+ of their deviation .limit 0.001."),
+        (("panoptic.semantic", float("nan")), "not finite"),
     ],
 )
 def test_a_wrong_engine_is_caught_and_not_timed(monkeypatch, change, why):
@@ -219,12 +224,12 @@ def test_agreement_of_known_differences():
     panoptic = torch.tensor([[[1000, 1000], [1000, 2000]]])
     maps = torch.tensor([[[[1.0, 2], [4, 8]]]])
 
-    def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, dict[str, Tensor]]:
+    def pass_of(logits: Tensor, panoptic: Tensor, depth: Tensor) -> tuple[Maps, dict[str, Maps]]:
         offset = maps.expand(1, 2, 2, 2)
-        found = {"logits": logits, "center": maps, "offset": offset, "inverse": 1 / depth}
-        return found, {"panoptic": panoptic}
+        found = dict(zip(MAPS, (logits, maps, offset, 1 / depth), strict=True))
+        return found, {"panoptic": {"panoptic": panoptic}}
 
-    found = agreement.Agreement()
+    found = agreement.Agreement(infos(subject().tasks))
     other = depth * torch.tensor([1, 1, 1, 1.5]).view(2, 2)
     found.update(
         pass_of(maps, panoptic, depth), pass_of(maps + 0.5, torch.full_like(panoptic, 1000), other)
@@ -247,11 +252,11 @@ def test_one_far_value_is_no_wrong_engine_but_many_near_ones_are(precision):
     maps = torch.randn(1, 2, 100, 100, generator=generator)
 
     def judged(other: Tensor) -> str:
-        found = agreement.Agreement()
+        found = agreement.Agreement(infos(subject("tiny", ("panoptic",)).tasks))
         passes = [
             (
-                {"logits": it, "center": it[:, :1], "offset": it},
-                {"panoptic": torch.zeros(1, 100, 100)},
+                dict(zip(MAPS[:3], (it, it[:, :1], it), strict=True)),
+                {"panoptic": {"panoptic": torch.zeros(1, 100, 100)}},
             )
             for it in (maps, other)
         ]
@@ -396,14 +401,9 @@ def test_trained_weights_over_the_val_split(name):
     found = sorted(Path("runs").glob("*/last.pt"))
     if not found:
         pytest.skip("no trained run in runs/")
-<<<<<<< HEAD
-    from mtl_bench import deploy
-    from mtl_bench.data import scenes as synthetic
-=======
     from mtl_bench.bench import stored
-    from mtl_bench.data import synthetic
+    from mtl_bench.data import scenes as synthetic
     from mtl_bench.deploy import subject as subjects
->>>>>>> cd21242dbf68b6ea5828e41f3c03310c2f0eb8f5
 
     cell, trained = stored.deployed(found[0], None)
     what = subjects.subject(

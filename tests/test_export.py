@@ -8,17 +8,17 @@ import pytest
 import torch
 from small_networks import SIZE, images, model
 
-from mtl_bench.core import config
-from mtl_bench.core.config import load_recipe
+from mtl_bench.core.batch import Camera
+from mtl_bench.core.recipe import Recipe
+from mtl_bench.core.task import finish
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.deploy import export
 from mtl_bench.deploy.agreement import equal_share
-from mtl_bench.deploy.maps import finish_of
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 
-EVALUATE = load_recipe("smoke").evaluate
+TASKS = Recipe.tasks
 CAMERA = {
     "K": np.array([[[115, 0, 63.5], [0, 115, 31.5], [0, 0, 1]]], np.float32),
     "camera_height_m": np.array([1.4], np.float32),
@@ -26,10 +26,10 @@ CAMERA = {
 }
 
 
-def written(tmp_path, post, tasks=config.TASKS, metadata=None):
+def written(tmp_path, post, tasks=TASKS, metadata=None):
     net = model("tiny", tasks).net
     path = tmp_path / "out" / "net.onnx"
-    return export.export(net, SIZE, path, CITYSCAPES20, EVALUATE, post, metadata)
+    return export.export(net, SIZE, path, post, metadata)
 
 
 def names(path):
@@ -59,12 +59,12 @@ def test_the_file_passes_the_checker_and_says_what_it_is(tmp_path):
 
 
 MAPS = {
-    config.TASKS: ["semantic", "center", "offset", "inverse_depth"],
+    TASKS: ["semantic", "center", "offset", "inverse_depth"],
     ("panoptic",): ["semantic", "center", "offset"],
     ("depth",): ["inverse_depth"],
 }
 RESULTS = {
-    config.TASKS: ["panoptic", "depth_m", "points"],
+    TASKS: ["panoptic", "depth_m", "points"],
     ("panoptic",): ["panoptic"],
     ("depth",): ["depth_m", "points"],
 }
@@ -73,7 +73,7 @@ RESULTS = {
 SLOW = [pytest.param(tasks, marks=pytest.mark.slow) for tasks in list(MAPS)[1:]]
 
 
-@pytest.mark.parametrize("tasks", [config.TASKS, *SLOW])
+@pytest.mark.parametrize("tasks", [TASKS, *SLOW])
 def test_apart_the_two_files_fit_together(tmp_path, tasks):
     first, second = written(tmp_path, "apart", tasks)
     camera = list(CAMERA) if "depth" in tasks else []
@@ -85,11 +85,12 @@ def test_apart_the_two_files_fit_together(tmp_path, tasks):
     with torch.no_grad():
         out = model("tiny", tasks).net(image.permute(0, 3, 1, 2).float() / 255)
     if "panoptic" in tasks:
-        assert (maps["semantic"] == out.semantic_BCHW.argmax(1).numpy()).mean() > 0.999
-        assert np.allclose(maps["center"], out.center_B1HW, atol=1e-5)
-        assert np.allclose(maps["offset"], out.offset_B2HW, atol=1e-3)
+        own = out.maps["panoptic"]
+        assert (maps["semantic"] == own["semantic"].argmax(1).numpy()).mean() > 0.999
+        assert np.allclose(maps["center"], own["center"], atol=1e-5)
+        assert np.allclose(maps["offset"], own["offset"], atol=1e-3)
     if "depth" in tasks:
-        assert np.allclose(maps["inverse_depth"], out.inverse_depth[0], rtol=1e-4)
+        assert np.allclose(maps["inverse_depth"], out.maps["depth"]["inverse"], rtol=1e-4)
     found = run(second, maps | {name: CAMERA[name] for name in camera})
     assert list(found) == RESULTS[tasks]
 
@@ -97,17 +98,18 @@ def test_apart_the_two_files_fit_together(tmp_path, tasks):
 @pytest.mark.slow
 def test_inside_is_what_torch_computes(tmp_path):
     (path,) = written(tmp_path, "inside")
-    assert names(path) == (["image", *CAMERA], RESULTS[config.TASKS])
-    net = model("tiny").net
-    finish = finish_of(CITYSCAPES20, EVALUATE)
+    assert names(path) == (["image", *CAMERA], RESULTS[TASKS])
+    whole = model("tiny")
     for image in images(3):
         found = run(path, {"image": image.numpy(), **CAMERA})
         with torch.no_grad():
-            out = net(image.permute(0, 3, 1, 2).float() / 255)
-            camera = [torch.from_numpy(value) for value in CAMERA.values()]
-            maps = (out.semantic_BCHW, out.center_B1HW, out.offset_B2HW, out.inverse_depth[0])
-            expected = finish(*maps, *camera)
-        assert equal_share(expected["panoptic"], torch.from_numpy(found["panoptic"])) > 0.999
+            out = whole.net(image.permute(0, 3, 1, 2).float() / 255)
+            camera = Camera(*(torch.from_numpy(value) for value in CAMERA.values()))
+            results = finish(whole.tasks, out.maps, camera)
+            points = whole.tasks[1].points(results, camera)
+            expected = {"depth_m": results["depth"]["depth_m"], "points": points}
+        panoptic = results["panoptic"]["panoptic"]
+        assert equal_share(panoptic, torch.from_numpy(found["panoptic"])) > 0.999
         for name in ("depth_m", "points"):
             same = np.isclose(found[name], expected[name], rtol=1e-3, equal_nan=True)
             assert same.mean() > 0.999

@@ -16,6 +16,7 @@ from mtl_bench.core import canvas
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.device import Engine
 from mtl_bench.core.files import write_json
+from mtl_bench.core.plugins import PACKAGE
 from mtl_bench.core.view import Key, View
 from mtl_bench.show import figures
 from mtl_bench.show.figures import printed
@@ -254,3 +255,11 @@ def test_kitti_frames_are_found_by_their_names(tmp_path):
     (tmp_path / "empty" / "2011_09_26").mkdir(parents=True)
     with pytest.raises(ValueError, match="no frame of split 'val' is there"):
         figures.frames_in(tmp_path / "empty", "val")
+
+
+def test_no_module_names_a_task_or_a_data_set():
+    """Depth is a quantity here, of a Surface; which cameras there are, data sets cannot say yet."""
+    named = re.compile(r"panoptic|semantic|cityscapes|kitti|synthetic", re.IGNORECASE)
+    paths = [p for p in (PACKAGE / "show").rglob("*.py") if p.name != "cameras.py"]
+    assert len(paths) >= 9
+    assert not [path for path in paths if named.search(path.read_text(encoding="utf-8"))]

@@ -8,16 +8,20 @@ import torch
 from torch import Tensor, nn
 
 from mtl_bench.core import config
-from mtl_bench.core.batch import Batch
-from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.core.batch import Batch, Camera
+from mtl_bench.core.task import tasks_of
+from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.deploy import roofline, timer
 from mtl_bench.deploy.subject import prepare
 from mtl_bench.model import Outputs
-from mtl_bench.tasks import finish
+from mtl_bench.tasks import depth
+from mtl_bench.tasks.panoptic import grouping
 
 CLASSES = len(CITYSCAPES20)
 HEIGHT, WIDTH = 32, 64
 K_33 = torch.tensor([[57.6, 0, 31.5], [0, 57.6, 15.5], [0, 0, 1]])
+CAMERA = Camera(K_33[None], torch.tensor([1.4]), torch.tensor([0.02]))
+RECIPE = config.Recipe()
 TIMING = config.Latency(passes=8, warmup=2)
 
 
@@ -35,22 +39,23 @@ class FakeNet(nn.Module):
     def forward(self, image_B3HW: Tensor) -> Outputs:
         self.seen.append(image_B3HW)
         maps = self.conv(image_B3HW)
-        out = Outputs()
-        if "panoptic" in self.tasks:
-            out.semantic_BCHW = maps[:, :CLASSES]
-            out.center_B1HW = maps[:, CLASSES : CLASSES + 1].sigmoid()
-            out.offset_B2HW = maps[:, CLASSES + 1 : CLASSES + 3]
-        if "depth" in self.tasks:
-            out.inverse_depth = [maps[:, -1:].sigmoid() * 2]
+        instances = {
+            "semantic": maps[:, :CLASSES],
+            "center": maps[:, CLASSES : CLASSES + 1].sigmoid(),
+            "offset": maps[:, CLASSES + 1 : CLASSES + 3],
+        }
+        inverse = {"inverse": maps[:, -1:].sigmoid() * 2}
         if self.training:
-            out.inverse_depth.append(self.auxiliary(image_B3HW))
-        return out
+            inverse["inverse.1"] = self.auxiliary(image_B3HW)
+        found = {"panoptic": instances, "depth": inverse}
+        return Outputs({name: found[name] for name in self.tasks})
 
 
 class FakeModel(nn.Module):
-    def __init__(self, tasks: tuple[str, ...] = config.TASKS) -> None:
+    def __init__(self, tasks: tuple[str, ...] = RECIPE.tasks, labels=CITYSCAPES20) -> None:
         super().__init__()
         self.net = FakeNet(tasks)
+        self.tasks = tasks_of(RECIPE, tasks, labels)
         self.pose = nn.Linear(1000, 1000)
 
 
@@ -69,10 +74,7 @@ def measure(
     return timer.measure(
         FakeModel() if model is None else model,
         images(4) if given is None else given,
-        K_33,
-        1.4,
-        CITYSCAPES20.things,
-        config.Evaluate(),
+        CAMERA,
         timing,
         device,
         **kwargs,
@@ -183,7 +185,7 @@ def test_every_form_of_image_is_the_same_image(kind):
     forms = {
         "uint8": image.to(torch.uint8),
         "float": image / 255,
-        "batch": Batch(["a"], image[None] / 255, K_33[None], torch.tensor([1.4]), torch.zeros(1)),
+        "batch": Batch(["a"], image[None] / 255, CAMERA),
     }
     model = FakeModel()
     measure(model, given=[forms[kind]])
@@ -204,36 +206,38 @@ def test_another_size_scales_image_and_intrinsics():
 @pytest.mark.parametrize("tasks", [("panoptic",), ("depth",), ("panoptic", "depth")])
 def test_only_the_tasks_present_are_finished(tasks, monkeypatch):
     calls = []
-    for name in ("group", "dgc_scale"):
-        function = getattr(finish, name)
+    for module, name in ((grouping, "group"), (depth, "dgc_scale")):
+        function = getattr(module, name)
 
         def spy(*args, name=name, function=function, **kwargs):
             calls.append(name)
             return function(*args, **kwargs)
 
-        monkeypatch.setattr(finish, name, spy)
+        monkeypatch.setattr(module, name, spy)
     result = measure(FakeModel(tasks))
     assert ("group" in calls) == ("panoptic" in tasks)
     assert ("dgc_scale" in calls) == ("depth" in tasks)
     assert result["latency.postprocess_ms"] > 0
 
 
-def test_depth_is_scaled_from_the_road_and_the_pitch_that_were_given(monkeypatch):
+@pytest.mark.parametrize("labels", [CITYSCAPES20, CITYSCAPES19], ids=["20 classes", "19 classes"])
+def test_depth_is_scaled_from_the_road_and_the_calibrated_pitch(monkeypatch, labels):
+    """Of data sets without the ego vehicle, too, whose road is class 0."""
     seen = []
-    function = finish.dgc_scale
+    function = depth.dgc_scale
 
-    def spy(depth, K, height, road, pitch_rad_B):
+    def spy(depth_m, K, height, road, pitch_rad_B):
         seen.append((road, pitch_rad_B))
-        return function(depth, K, height, road, pitch_rad_B=pitch_rad_B)
+        return function(depth_m, K, height, road, pitch_rad_B=pitch_rad_B)
 
-    monkeypatch.setattr(finish, "dgc_scale", spy)
-    model = FakeModel()
-    measure(model, road=0, pitch_rad=0.02)
+    monkeypatch.setattr(depth, "dgc_scale", spy)
+    model = FakeModel(labels=labels)
+    measure(model)
     road_BHW, pitch_rad_B = seen[-1]
     assert pitch_rad_B.tolist() == pytest.approx([0.02])
     with torch.inference_mode():
         logits = model.net.conv(model.net.seen[-1])[:, :CLASSES]
-    assert torch.equal(road_BHW, logits.argmax(1) == 0)
+    assert torch.equal(road_BHW, logits.argmax(1) == labels.index("road"))
 
 
 def test_the_model_keeps_its_mode_and_weights():
@@ -266,10 +270,7 @@ def test_cuda_events_time_the_same_stages():
     result = timer.measure(
         FakeModel().cuda(),
         images(4),
-        K_33,
-        1.4,
-        CITYSCAPES20.things,
-        config.Evaluate(),
+        CAMERA,
         TIMING,
         "cuda",
     )

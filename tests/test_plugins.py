@@ -262,13 +262,13 @@ class Normals(Task):
 
 
 def test_a_further_task_changes_no_cell_that_does_not_name_it(tmp_path):
-    cells = [Cell(load_recipe(name), "tiny", "fixed") for name in ("smoke", "kitti", "paper")]
+    cells = [Cell(load_recipe(name), "tiny", "fixed") for name in ("smoke", "kitti", "medium")]
     before = [(cell.id, provenance.code(cell), cell.tasks) for cell in cells]
     terms = [term.name for term in terms_of(tasks_of_cell(cells[0]))]
     put(tmp_path / "extra" / "tasks" / "normals.py", TASK)
     plugins.add_folder("extra")
     assert "normals" in plugins.files("tasks")
-    again = [Cell(load_recipe(name), "tiny", "fixed") for name in ("smoke", "kitti", "paper")]
+    again = [Cell(load_recipe(name), "tiny", "fixed") for name in ("smoke", "kitti", "medium")]
     assert [(cell.id, provenance.code(cell), cell.tasks) for cell in again] == before
     assert [term.name for term in terms_of(tasks_of_cell(again[0]))] == terms
     three = replace(cells[0], tasks=("normals", "depth", "panoptic"))
@@ -323,5 +323,5 @@ def test_columns_are_nothing_but_values(tmp_path, columns):
         tmp_path / "tasks" / "normals.py",
         TASK.partition("    columns")[0] + f"    columns = {columns}\n",
     )
-    with pytest.raises(ValueError, match=r"task 'normals': columns are a tuple of Column"):
+    with pytest.raises(ValueError, match=r"task 'normals': columns are plain values and Column"):
         quality.quality()

@@ -7,20 +7,23 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from mtl_bench.data.layouts import KITTI, layout_of
 from test_synthetic import digests, read, warp_error
 
-from mtl_bench.core.config import Cell, Data, load_recipe
+from mtl_bench.core.config import Cell, Data, Recipe, load_recipe
+from mtl_bench.core.dataset import dataset_in, dataset_of
+from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data import kitti_files, velodyne
 from mtl_bench.data import scenes as synthetic
+from mtl_bench.data.kitti import Kitti
 from mtl_bench.data.labels import CITYSCAPES19
-from mtl_bench.data.loader import open_dataset
+from mtl_bench.data.samples import open_samples
 from mtl_bench.data.scenes import kitti as kitti_layout
 from mtl_bench.data.scenes import render
 from mtl_bench.data.scenes.settings import SPLITS, Settings
+from mtl_bench.data.synthetic_kitti import SyntheticKitti
 
 HEIGHT, WIDTH, FRAMES, SEED = 48, 144, 4, 3
-SETTINGS = Settings(HEIGHT, WIDTH, 5, 2, 17, SEED, FRAMES, FRAMES // 2, 10, layout=KITTI)
+SETTINGS = Settings(HEIGHT, WIDTH, 5, 2, 17, SEED, FRAMES, FRAMES // 2, 10, layout=Kitti.layout)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +31,7 @@ def root(tmp_path_factory):
     out = tmp_path_factory.mktemp("kitti") / "set"
     counts = SETTINGS.counts
     return synthetic.write(
-        out, HEIGHT, WIDTH, *counts, SEED, frames=FRAMES, progress=False, layout=KITTI
+        out, HEIGHT, WIDTH, *counts, SEED, frames=FRAMES, progress=False, layout=Kitti.layout
     )
 
 
@@ -45,7 +48,7 @@ def drive_of(root, split, number):
 
 def test_lists_and_files(root):
     """Lists as PackNet has them; every frame in them has neighbours, labels and a scan."""
-    assert layout_of(root) == KITTI
+    assert dataset_in(root) is Kitti
     for split, scenes in enumerate((5, 2, 17)):
         name = kitti_layout.LISTS[SPLITS[split]]
         lines = (root / "data_splits" / f"{name}.txt").read_text().splitlines()
@@ -65,12 +68,16 @@ def test_lists_and_files(root):
     assert sum(map(len, drives)) == len(set.union(*drives)) == 24
 
 
+def opened(cell, split, root, training=False, **truth):
+    return open_samples(cell.recipe, tasks_of_cell(cell), split, root, training, **truth)
+
+
 def test_one_test_frame_in_sixteen_has_no_improved_map(root):
     cell = Cell(load_recipe("kitti-smoke"), "none", "none")
     cell = replace(cell, recipe=replace(cell.recipe, data=replace(
         cell.recipe.data, height=HEIGHT, width=WIDTH)))  # fmt: skip
     counts = {
-        (split, truth): len(open_dataset(cell, split, root, training=False, truth=truth))
+        (split, truth): len(opened(cell, split, root, truth=truth))
         for split in ("val", "test")
         for truth in ("improved", "velodyne")
     }
@@ -80,7 +87,7 @@ def test_one_test_frame_in_sixteen_has_no_improved_map(root):
         ("test", "improved"): 16 * per, ("test", "velodyne"): 17 * per,
     }  # fmt: skip
     assert not (drive_of(root, 2, 15) / "proj_depth").exists()
-    assert len(open_dataset(cell, "train", root, training=True)) == 5 * per
+    assert len(opened(cell, "train", root, training=True)) == 5 * per
 
 
 @pytest.mark.parametrize(("split", "number"), [(0, 0), (1, 1), (2, 3)])
@@ -173,7 +180,7 @@ def test_bytes_depend_on_seed_and_number_alone(tmp_path):
     for name, processes, seed in (("one", 1, 1), ("two", 2, 1), ("other", 1, 2)):
         out = tmp_path / name
         synthetic.write(
-            out, 32, 96, 3, 1, 1, seed, processes=processes, progress=False, layout=KITTI
+            out, 32, 96, 3, 1, 1, seed, processes=processes, progress=False, layout=Kitti.layout
         )
         sets[name] = digests(out)
     assert len(sets["one"]) > 40
@@ -182,16 +189,20 @@ def test_bytes_depend_on_seed_and_number_alone(tmp_path):
     assert not [name for name in images if sets["other"][name] == sets["one"][name]]
 
 
-def test_ensure_renders_by_the_data_sets_name(tmp_path):
+def test_a_recipe_renders_by_the_data_sets_name(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     data = Data(dataset="synthetic-kitti", height=16, width=48, train_scenes=1, val_scenes=0,
                 test_scenes=2)  # fmt: skip
-    out = synthetic.ensure(data, tmp_path, progress=False)
+    kind = dataset_of(Recipe(data=data))
+    assert kind is SyntheticKitti
+    out = kind.render(data, quiet=True)
+    assert out.is_relative_to(tmp_path)
     assert out.name.startswith("synthetic-kitti-16x48-")
-    assert layout_of(out) == KITTI
+    assert dataset_in(out) is Kitti
     assert (out / "data_splits/eigen_val_files.txt").read_text() == ""
     assert len((out / "data_splits/eigen_test_files.txt").read_text().splitlines()) == 2
     before = digests(out)
-    assert synthetic.ensure(data, tmp_path, progress=False) == out
+    assert kind.render(data, quiet=True) == out
     assert digests(out) == before
 
 
@@ -222,6 +233,6 @@ def test_the_command_renders_kittis_layout(tmp_path):
     command = [sys.executable, "-m", "mtl_bench", "data", "synthetic", "--layout", "kitti"]
     command += ["--out", str(tmp_path / "k"), "--size", "32x96", "--scenes", "2", "-q"]
     subprocess.run([*command, "--val-scenes", "1", "--test-scenes", "1"], check=True)
-    assert layout_of(tmp_path / "k") == KITTI
+    assert dataset_in(tmp_path / "k") is Kitti
     image = next((tmp_path / "k").rglob("image_02/data/*.png"))
     assert cv2.imread(str(image)).shape == (32, 96, 3)
