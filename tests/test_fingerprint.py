@@ -11,6 +11,7 @@ from textwrap import dedent
 
 import pytest
 
+from mtl_bench.bench import jobs
 from mtl_bench.core import fingerprint, plugins, provenance
 from mtl_bench.core.config import Cell, Recipe
 from mtl_bench.core.fingerprint import Root
@@ -345,7 +346,7 @@ def test_each_stage_has_what_it_runs(reached):
     assert "PanopticQuality" in names(reached["evaluate"], "tasks.panoptic.metrics")
     assert not names(reached["evaluate"], "tasks.depth.losses")
     assert "time_cell" in names(reached["time"], "bench.stored")
-    assert "measure" in {name for path, name in reached["time"] if path.stem == "latency"}
+    assert "measure" in names(reached["time"], "deploy.timer")
     assert not names(reached["time"], "tasks.panoptic.metrics")
     for stage in fingerprint.STAGES:
         assert "Network" in names(reached[stage], "model.network")
@@ -362,10 +363,13 @@ STARTS = {"run", "__init__", "export_predictions"}
 
 
 def test_all_that_a_cell_imports_is_covered_or_makes_no_numbers(reached):
+    """By a stage of a cell, or by the timing of an engine."""
     done = subprocess.run(
         [sys.executable, "-c", PROBE], capture_output=True, text=True, check=True, env=os.environ
     )
-    covered = {path for found in reached.values() for path, _ in found}
+    timings = [jobs.roots(jobs.Timing("tiny", name)) for name in plugins.files("engines")]
+    timed = [fingerprint.reach("time", roots) for roots in timings]
+    covered = {path for found in [*reached.values(), *timed] for path, _ in found}
     left = {
         path.relative_to(PACKAGE).as_posix()
         for path in map(Path, done.stdout.split())

@@ -132,6 +132,7 @@ class Task:
     terms: ClassVar[tuple[Term, ...]]
     kind: ClassVar[str] = "regression"  # the likelihood behind most of the sum of its terms
     needs: ClassVar[frozenset[str]] = frozenset()  # fields of a training sample, beside the image
+    reads: ClassVar[frozenset[str]] = frozenset()  # those of them that `losses` itself reads
     truth: ClassVar[frozenset[str]] = frozenset()  # fields of an evaluation sample
     after: ClassVar[tuple[str, ...]] = ()  # tasks whose results `finish` may read
     columns: ClassVar[tuple[Column, ...]] = ()  # of its metrics
@@ -158,6 +159,7 @@ class Task:
             "terms",
             "kind",
             "needs",
+            "reads",
             "head",
             "activate",
             "extra",

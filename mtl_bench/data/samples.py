@@ -5,7 +5,7 @@ what tasks make of its fields; in evaluation it is the plain frame with the trut
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -46,7 +46,8 @@ def open_samples(
         root, split, recipe.data, needs=needs, training=training, truth=truth, **more
     )
     targets = [task.targets for task in tasks]
-    return Samples(dataset, recipe.augment if training else None, targets)
+    keep = frozenset().union(*(task.reads for task in tasks))
+    return Samples(dataset, recipe.augment if training else None, targets, keep)
 
 
 class Samples:
@@ -55,13 +56,19 @@ class Samples:
     Args:
         augment: random changes of training samples; None for evaluation samples.
         targets: what makes further fields of a training sample.
+        keep: the data set's fields that a training sample has also after that; others, as large as
+            what was made of them, go.
     """
 
     def __init__(
-        self, dataset: Dataset, augment: Augment | None = None, targets: Sequence[Targets] = ()
+        self,
+        dataset: Dataset,
+        augment: Augment | None = None,
+        targets: Sequence[Targets] = (),
+        keep: Collection[str] = (),
     ) -> None:
         self.dataset, self.names = dataset, dataset.names
-        self._augment, self._targets = augment, tuple(targets)
+        self._augment, self._targets, self._keep = augment, tuple(targets), frozenset(keep)
         self._kept: dict[int, DecodedFrame] | None = {} if dataset.data.cache else None
 
     def __len__(self) -> int:
@@ -115,6 +122,8 @@ class Samples:
             }
         for make in self._targets:
             sample.fields |= make(sample)
+        for name in self.dataset.fields.keys() - self._keep:
+            sample.fields.pop(name, None)
         return sample
 
 

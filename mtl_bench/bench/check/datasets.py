@@ -73,7 +73,8 @@ def _evaluation(kind: type[Dataset], root: Path, data: Data) -> None:
 def _training(kind: type[Dataset], root: Path, data: Data) -> None:
     """A training sample is a function of its seed, at the input's size."""
     dataset = kind(root, "train", data, needs=kind.fields, training=True)
-    samples = Samples(dataset, Augment(scales=(0.75, 1.5), crop=(data.height, data.width)))
+    augment = Augment(scales=(0.75, 1.5), crop=(data.height, data.width))
+    samples = Samples(dataset, augment, keep=kind.fields)
     one, two, other = (
         samples.sample(0, Generator().manual_seed(seed)).tensors() for seed in (1, 1, 2)
     )
