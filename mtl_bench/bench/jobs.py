@@ -156,11 +156,19 @@ class Kind(ABC, Generic[J]):
     again: Mapping[str, tuple[str, ...]]  # --rerun -> what it runs beside
     why: str  # the key in a row for what is wrong
     stages: tuple[str, ...]
+    row: str  # behind a job's slug: its row
+    log: str  # and what its process printed
 
-    @abstractmethod
-    def row_file(self, job: J, runs: Path) -> Path: ...
-    @abstractmethod
-    def log_file(self, job: J, runs: Path) -> Path: ...
+    def row_file(self, job: J, runs: Path) -> Path:
+        return runs / f"{job.slug}{self.row}"
+
+    def log_file(self, job: J, runs: Path) -> Path:
+        return runs / f"{job.slug}{self.log}"
+
+    def parts(self, job: J) -> dict[str, str]:
+        """Part of the code -> what a reader calls it."""
+        return {"backbone": f"backbones/{job.backbone}.py"}
+
     @abstractmethod
     def code(self, job: J) -> provenance.Code:
         """Fingerprints of the code of each of its stages.
@@ -168,10 +176,6 @@ class Kind(ABC, Generic[J]):
         Raises:
             ValueError: a plug-in that is not there, or is no Python.
         """
-
-    @abstractmethod
-    def parts(self, job: J) -> dict[str, str]:
-        """Part of the code -> what a reader calls it."""
 
     @abstractmethod
     def identity(self, job: J) -> dict[str, Any]:
@@ -211,19 +215,14 @@ class Cells(Kind[Cell]):
     }
     why = "error"
     stages = STAGES
-
-    def row_file(self, job: Cell, runs: Path) -> Path:
-        return runs / job.slug / "row.json"
-
-    def log_file(self, job: Cell, runs: Path) -> Path:
-        return runs / job.slug / "log.txt"
+    row, log = "/row.json", "/log.txt"
 
     def code(self, job: Cell) -> provenance.Code:
         return provenance.code(job)
 
     def parts(self, job: Cell) -> dict[str, str]:
         methods = [f"methods/{name}.py" for name in plugins.part_names(job.method)]
-        return {"method": " or ".join(methods), "backbone": f"backbones/{job.backbone}.py"}
+        return {"method": " or ".join(methods), **super().parts(job)}
 
     def identity(self, job: Cell) -> dict[str, Any]:
         """Rows travel, so a weights file goes without its folder."""
@@ -268,18 +267,10 @@ class Timings(Kind[Timing]):
     }
     why = "why"
     stages = ("time",)
-
-    def row_file(self, job: Timing, runs: Path) -> Path:
-        return runs / f"{job.slug}.json"
-
-    def log_file(self, job: Timing, runs: Path) -> Path:
-        return runs / f"{job.slug}.log"
+    row, log = ".json", ".log"
 
     def code(self, job: Timing) -> provenance.Code:
         return {"time": fingerprints("time", roots(job))}
-
-    def parts(self, job: Timing) -> dict[str, str]:
-        return {"backbone": f"backbones/{job.backbone}.py"}
 
     def identity(self, job: Timing) -> dict[str, Any]:
         return {

@@ -12,12 +12,6 @@ if TYPE_CHECKING:
     from mtl_bench.show.predict import Predictor
 
 FRAMES = "Which frames"
-RunOption = Annotated[
-    Path,
-    typer.Option(
-        "--checkpoint", metavar="RUN|CHECKPOINT", help="A folder in runs/, or its last.pt."
-    ),
-]
 FrameOption = Annotated[
     str | None,
     typer.Option(
@@ -68,7 +62,7 @@ def register(app: typer.Typer) -> None:
 
 
 def prediction(
-    checkpoint: RunOption,
+    checkpoint: o.CheckpointOption,
     out: OutOption,
     frame: FrameOption = None,
     seed: SeedOption = 0,
@@ -131,7 +125,7 @@ def qualitative(
 
 
 def cloud(
-    checkpoint: RunOption,
+    checkpoint: o.CheckpointOption,
     out: Annotated[Path, typer.Option(metavar="FILE.html", help="Where the page goes.")],
     frame: FrameOption = None,
     seed: SeedOption = 0,

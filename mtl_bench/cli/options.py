@@ -60,6 +60,12 @@ DataOption = Annotated[
         show_default=False,
     ),
 ]
+CheckpointOption = Annotated[
+    Path,
+    typer.Option(
+        "--checkpoint", metavar="RUN|CHECKPOINT", help="A folder in runs/, or its last.pt."
+    ),
+]
 RunsOption = Annotated[
     Path, typer.Option("--runs", metavar="DIR", help="Where cells run and their rows are kept.")
 ]

@@ -31,9 +31,7 @@ def predict(
             metavar="INPUT...", help="Images, folders of images or patterns; or one video."
         ),
     ],
-    checkpoint: Annotated[
-        Path, typer.Option(metavar="RUN|CHECKPOINT", help="A folder in runs/, or its last.pt.")
-    ],
+    checkpoint: o.CheckpointOption,
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="A new folder; it appears when all is done.")
     ],

@@ -19,9 +19,7 @@ def register(app: typer.Typer) -> None:
 
 
 def pseudo_label(
-    checkpoint: Annotated[
-        Path, typer.Option(metavar="RUN|CHECKPOINT", help="A folder in runs/, or its last.pt.")
-    ],
+    checkpoint: o.CheckpointOption,
     out: Annotated[
         Path | None,
         typer.Option(

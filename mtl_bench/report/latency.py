@@ -165,7 +165,7 @@ def tabulate(rows: Sequence[Row], quality: Sequence[Row] = ()) -> Timings:
     """A line per timing, in the rows' order.
 
     Args:
-        rows: as `latency_runs.rows` gives them.
+        rows: as `store.rows` gives them.
         quality: done rows of trained cells, whose headlines the plots set beside the speed.
     """
     references = {_alike(row): row for row in rows if _is_reference(row)}
@@ -419,7 +419,7 @@ def build(
 
     Args:
         grid: its name, question, recipe and skips.
-        rows: one per timing in the grid's order, as `latency_runs.rows` gives them.
+        rows: one per timing in the grid's order, as `store.rows` gives them.
         out_dir: created where absent; what an earlier build left is replaced.
         quality: done rows of trained cells of the same backbones.
         command: what reproduces the report.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mtl_bench.bench.jobs import load_cell
+from mtl_bench.bench.jobs import load_run
 from mtl_bench.bench.stored import load_model
 from mtl_bench.core.config import Cell, did_you_mean
 from mtl_bench.core.dataset import dataset_in, layouts
@@ -15,7 +15,6 @@ from mtl_bench.core.labels import LabelSet
 from mtl_bench.show.predict import Predicted, Predictor
 from mtl_bench.show.predict.cameras import Given, Mounted, camera_of
 from mtl_bench.show.predict.video import read_image
-from mtl_bench.train.loop import CHECKPOINT
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,7 @@ def load(run: Path, device: str = "auto") -> Predictor:
     Raises:
         ValueError: nothing there, or no readable checkpoint.
     """
-    if not run.exists():
-        raise ValueError(f"no run or checkpoint '{run}'")
-    weights = run / CHECKPOINT if run.is_dir() else run
-    cell = load_cell(weights.parent / "cell.json")
+    cell, weights = load_run(run)
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
     return Predictor(load_model(cell, weights, engine), cell, engine.device)
 
