@@ -7,15 +7,17 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from mtl_bench.bench import claim, launch, results
-from mtl_bench.bench.grid import with_parents
+from mtl_bench.bench import store
+from mtl_bench.bench.jobs import with_parents
 from mtl_bench.bench.run import run_cell
 from mtl_bench.bench.stored import load_model, reevaluate
 from mtl_bench.cli.app import app
+from mtl_bench.core import locks
 from mtl_bench.core.config import Cell, load_recipe, to_dict
-from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.data.loader import open_dataset
-from mtl_bench.evaluate import pseudo_frames
+from mtl_bench.core.files import write_json
+from mtl_bench.core.task import tasks_of_cell
+from mtl_bench.data import pseudo_frames
+from mtl_bench.data.samples import open_samples
 from mtl_bench.train import checkpoint
 from mtl_bench.train.progress import Interrupted
 
@@ -36,8 +38,8 @@ def cells():
 
 
 def execute(cell, runs, root):
-    with claim.claim(results.run_dir(cell, runs)):
-        directory, _ = results.begin(cell, runs)
+    with locks.claim(store.run_dir(cell, runs)):
+        directory, _ = store.begin(cell, runs)
         return run_cell(cell, directory, root, "cpu", echo=lambda line: None)
 
 
@@ -52,7 +54,7 @@ def finished(cells, smoke_root, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rows(cells, finished):
-    return {name: results.load_row(finished / cell.slug) for name, cell in cells.items()}
+    return {name: store.load_row(finished / cell.slug) for name, cell in cells.items()}
 
 
 def quality(row):
@@ -139,13 +141,13 @@ def test_it_trains_on_both_kinds_of_labels(cells, finished, smoke_root, tmp_path
     from mtl_bench.train import loop as train
 
     copy_parent(cells, finished, tmp_path)
-    opened, open_dataset = [], train.open_dataset
+    opened, open_samples = [], train.open_samples
 
     def spy(*given, **settings):
-        opened.append(open_dataset(*given, **settings))
+        opened.append(open_samples(*given, **settings))
         return opened[-1]
 
-    monkeypatch.setattr(train, "open_dataset", spy)
+    monkeypatch.setattr(train, "open_samples", spy)
     row = execute(cells["video"], tmp_path, smoke_root)
     human = cells["video"].recipe.data.train_scenes
     assert [len(dataset) for dataset in opened] == [human + row["protocol"]["pseudo_frames"]]
@@ -197,7 +199,7 @@ def test_stopped_anywhere_it_ends_with_the_same_row(
         crash(patched)
         with pytest.raises(KeyboardInterrupt):
             execute(cells["video"], tmp_path, smoke_root)
-    assert results.status(cells["video"], tmp_path) == "interrupted"
+    assert store.status(cells["video"], tmp_path) == "interrupted"
     row = execute(cells["video"], tmp_path, smoke_root)
     assert quality(row) == quality(rows["video"])
     assert row["protocol"] == rows["video"]["protocol"]
@@ -216,7 +218,7 @@ def test_a_fresh_start_forgets_the_labels(cells, finished, tmp_path):
     folder = tmp_path / cells["video"].slug / "pseudo_labels" / "gtFine"
     folder.mkdir(parents=True)
     (tmp_path / cells["video"].slug / "taken.json").write_text("{}")
-    results.clear(tmp_path / cells["video"].slug)
+    store.clear(tmp_path / cells["video"].slug)
     assert list((tmp_path / cells["video"].slug).iterdir()) == []
 
 
@@ -237,7 +239,7 @@ def test_a_parent_without_a_usable_result_is_one_line(
             content = (finished / parent.slug / name).read_bytes()
             (tmp_path / parent.slug / name).write_bytes(content)
         if not gone:
-            row = results.load_row(tmp_path / parent.slug)
+            row = store.load_row(tmp_path / parent.slug)
             row["code"]["train"]["harness"] = "another"
             (tmp_path / parent.slug / "row.json").write_text(json.dumps(row))
     slug = cells[child].parents[0].slug
@@ -256,10 +258,11 @@ def test_side_by_side_gives_each_networks_outputs(cells, finished):
     )
     image = torch.rand(2, 3, 32, 64)
     both, first, second = (model.net(image) for model in (apart, panoptic, depth))
-    for name in ("semantic_BCHW", "center_B1HW", "offset_B2HW"):
-        assert torch.equal(getattr(both, name), getattr(first, name))
-    assert torch.equal(both.inverse_depth[0], second.inverse_depth[0])
-    assert apart.pose is None
+    for name, map_ in first.maps["panoptic"].items():
+        assert torch.equal(both.maps["panoptic"][name], map_)
+    assert torch.equal(both.maps["depth"]["inverse"], second.maps["depth"]["inverse"])
+    assert both.maps.keys() == {"panoptic", "depth"}
+    assert not any("pose" in name for name, _ in apart.named_parameters())
 
 
 # --- only what changed code concerns ---
@@ -280,7 +283,7 @@ def together(cells, finished, smoke_root):
         assert not list(directory.glob("set-aside-*"))
         return done.output
 
-    renew.state = lambda: results.inspect(cells["together"], finished)
+    renew.state = lambda: store.inspect(cells["together"], finished)
     renew.directory = directory
     yield renew
     for path, content in kept.items():
@@ -289,7 +292,7 @@ def together(cells, finished, smoke_root):
 
 def test_a_stale_evaluation_is_made_again_from_the_checkpoint(together, rows, change_harness):
     row = dict(rows["together"], metric=rows["together"]["metric"] | {"panoptic.pq": -1.0})
-    results.write_json(together.directory / "row.json", row)
+    write_json(together.directory / "row.json", row)
     change_harness("evaluate")
     assert together.state().why == "evaluate: harness changed"
     text = together()
@@ -317,7 +320,7 @@ FLAT = {"method": "a", "backbone": "b", "harness": "c"}
 
 
 def test_a_row_of_an_older_version_is_stamped_anew_if_its_checkpoint_gives_it_back(together, rows):
-    results.write_json(together.directory / "row.json", rows["together"] | {"code": FLAT})
+    write_json(together.directory / "row.json", rows["together"] | {"code": FLAT})
     assert together.state().why == "stamped by an older version"
     assert "every metric is that of the row" in together()
     assert together.state().word == "done"
@@ -327,7 +330,7 @@ def test_a_row_of_an_older_version_is_stamped_anew_if_its_checkpoint_gives_it_ba
 def test_and_otherwise_it_is_stale_for_training(together, rows):
     row = dict(rows["together"], code=FLAT, metric=dict(rows["together"]["metric"]))
     row["metric"]["panoptic.pq"] += 1e-12
-    results.write_json(together.directory / "row.json", row)
+    write_json(together.directory / "row.json", row)
     assert "1 of" in together()
     state = together.state()
     assert (state.word, state.trained) == ("stale", False)
@@ -350,21 +353,21 @@ def test_latency_alone_can_be_taken_again(name, cells, finished, rows, smoke_roo
     done = CliRunner().invoke(app, ["train", *arguments, "--data", str(smoke_root)])
     assert done.exit_code == 0, done.output
     assert "12.5 ms a frame" in done.output
-    dataset = open_dataset(cell, cell.recipe.evaluate.split, smoke_root, training=False)
-    pitch_rad = float(dataset.sample(0, None).camera_pitch_rad_B)
-    assert pitch_rad != 0
-    assert seen[0][-2:] == (CITYSCAPES20.index("road"), pitch_rad)
-    after = results.load_row(finished / cell.slug)
+    tasks, split = tasks_of_cell(cell), cell.recipe.evaluate.split
+    frame = open_samples(cell.recipe, tasks, split, smoke_root, training=False).sample(0, None)
+    assert frame.camera.pitch_rad_B != 0
+    assert seen[0][2].pitch_rad_B == frame.camera.pitch_rad_B
+    after = store.load_row(finished / cell.slug)
     assert after["metric"] == before["metric"] | {"latency.mean_ms": 12.5}
     assert after["time"].keys() == before["time"].keys()
     assert {k: after[k] for k in ("cell", "code", "env")} == {
         k: before[k] for k in ("cell", "code", "env")
     }
-    results.write_json(finished / cell.slug / "row.json", before)
+    write_json(finished / cell.slug / "row.json", before)
 
 
 def test_there_is_no_latency_to_take_again_without_a_row(cells, tmp_path, smoke_root):
-    results.write_json(tmp_path / "cell.json", to_dict(cells["together"]))
+    write_json(tmp_path / "cell.json", to_dict(cells["together"]))
     arguments = ["train", str(tmp_path / "cell.json"), "--latency", "--runs", str(tmp_path)]
     done = CliRunner().invoke(app, [*arguments, "--data", str(smoke_root)])
     assert done.exit_code == 2
@@ -373,5 +376,5 @@ def test_there_is_no_latency_to_take_again_without_a_row(cells, tmp_path, smoke_
 
 def test_a_grid_times_its_finished_cells_again(cells, finished):
     todo = [cells["together"], replace(cells["together"], seed=7)]
-    assert launch.to_run(todo, finished, "latency") == todo
-    assert launch.to_run(todo, finished) == todo[1:]
+    assert store.to_run(todo, finished, "latency") == todo
+    assert store.to_run(todo, finished) == todo[1:]

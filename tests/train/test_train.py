@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from mtl_bench.core.files import write_json
 
 from mtl_bench.core.config import Optim, to_dict
 from mtl_bench.core.device import Engine, choose_device, seed_for
+from mtl_bench.core.files import write_json
 from mtl_bench.data.loader import train_batches
 from mtl_bench.train import checkpoint
 from mtl_bench.train.curve import data_share
