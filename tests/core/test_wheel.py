@@ -53,6 +53,6 @@ def test_nothing_called_methods_lands_in_site_packages(installed):
     (site,) = installed.glob("lib/python*/site-packages")
     assert not (site / "methods").exists()
     assert not (site / "backbones").exists()
-    assert (site / "mtl_bench" / "recipes" / "small.toml").is_file()
+    assert (site / "mtl_bench" / "bench" / "recipes" / "small.toml").is_file()
     assert (site / "mtl_bench" / "report" / "page.html.j2").is_file()
     assert (site / "mtl_bench" / "figures" / "cloud.html.j2").is_file()

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from mtl_bench.core.view import METRES
+from mtl_bench.data.cameras import Mounted
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.show.figures import Shown, cloud_page
 from mtl_bench.show.figures.cloud_page import POINTS, leveled, page_of, thinned
 from mtl_bench.show.predict import Predicted
-from mtl_bench.show.predict.cameras import Mounted
 from mtl_bench.show.predict.point_cloud import PointCloud
 from mtl_bench.tasks.depth.picture import DepthView, scale_of
 from mtl_bench.tasks.panoptic.picture import PanopticView

@@ -12,8 +12,9 @@ from mtl_bench.core.config import Cell, did_you_mean
 from mtl_bench.core.dataset import dataset_in, layouts
 from mtl_bench.core.device import Engine, choose_device
 from mtl_bench.core.labels import LabelSet
+from mtl_bench.data.cameras import Mounted
 from mtl_bench.show.predict import Predicted, Predictor
-from mtl_bench.show.predict.cameras import Given, Mounted, camera_of
+from mtl_bench.show.predict.cameras import Given, camera_of
 from mtl_bench.show.predict.video import read_image
 
 

@@ -21,8 +21,9 @@ from typing import Any
 
 from mtl_bench.core.canvas import Image
 from mtl_bench.core.view import Surface
+from mtl_bench.data.cameras import Mounted
 from mtl_bench.show.predict import Predicted, Predictor
-from mtl_bench.show.predict.cameras import Given, Mounted, camera_of
+from mtl_bench.show.predict.cameras import Given, camera_of
 from mtl_bench.show.predict.files import video_frame, write_files
 from mtl_bench.show.predict.recording import Recording, missing
 from mtl_bench.show.predict.video import IMAGE_SUFFIXES, Reader, Writer, is_image, read_image

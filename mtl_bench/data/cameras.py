@@ -1,0 +1,82 @@
+"""Cameras of single images: what the files of Cityscapes and KITTI say, found or named.
+
+An image that lies in one of these layouts has its calibration there.
+"""
+
+import functools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mtl_bench.data import cityscapes_files as cityscapes
+from mtl_bench.data import kitti_files as kitti
+
+KITTI_FILE = "calib_cam_to_cam.txt"
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """A camera: intrinsics in pixels of its images, and how it is mounted."""
+
+    K_33: NDArray[np.float64]
+    height_m: float | None  # above the road; None: not known
+    pitch_rad: float  # to the road, positive looks down
+    source: str  # where all this comes from, in words
+    guessed: bool = False
+
+
+def of_layout(path: Path, size: tuple[int, int]) -> Mounted | None:
+    """From the folders that the image lies in: Cityscapes' or KITTI's."""
+    path = path.resolve()
+    for folder in path.parents:
+        if folder.name in (cityscapes.IMAGE.folder, cityscapes.SEQUENCE.folder):
+            name = path.name.removesuffix(cityscapes.IMAGE.suffix)
+            cameras = folder.parent / cityscapes.CAMERA.folder / path.relative_to(folder).parent
+            if not cameras.is_dir():
+                return None
+            nearest = cityscapes.camera_names(_names_in(cameras), {name}).get(name)
+            kind = cityscapes.CAMERA.suffix
+            return from_json(cameras / f"{nearest}{kind}") if nearest else None
+        if re.fullmatch(r"image_\d\d", folder.name):
+            calibration = folder.parent.parent / KITTI_FILE
+            return from_calibration(calibration, path, size) if calibration.is_file() else None
+    return None
+
+
+@functools.lru_cache(4)
+def _names_in(cameras: Path) -> frozenset[str]:
+    """Frames that have a camera file in this folder."""
+    files = cameras.glob(f"*{cityscapes.CAMERA.suffix}")
+    return frozenset(file.name.removesuffix(cityscapes.CAMERA.suffix) for file in files)
+
+
+def from_json(path: Path) -> Mounted:
+    """Of a camera file of Cityscapes."""
+    camera = cityscapes.read_camera(path)
+    K_33 = matrix(camera.fx, camera.fy, camera.u0, camera.v0)
+    return Mounted(K_33, camera.height_m, camera.pitch_rad, str(path))
+
+
+def from_calibration(calibration: Path, path: Path, size: tuple[int, int]) -> Mounted:
+    """Of KITTI: the rectified camera of the image's folder image_02 or image_03; elsewhere 02."""
+    if calibration.name != KITTI_FILE:
+        raise ValueError(f"{calibration}: KITTI's intrinsics are in a file called {KITTI_FILE}")
+    found = re.findall(r"image_(\d\d)", str(path))
+    number = found[-1] if found else "02"
+    camera = kitti.read_camera(calibration.parent, number)
+    if size != camera.size:
+        raise ValueError(
+            f"{calibration}: for images of {camera.size[0]}x{camera.size[1]} pixels, not "
+            f"{size[0]}x{size[1]}; take the calibration of the image's own date"
+        )
+    height_m = kitti.CAMERA_HEIGHT_M
+    source = f"{calibration}, camera {number}; height {height_m} m, which is KITTI's"
+    return Mounted(camera.K_33, height_m, 0.0, source)
+
+
+def matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    """Intrinsics [3,3]."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
