@@ -55,4 +55,4 @@ def test_nothing_called_methods_lands_in_site_packages(installed):
     assert not (site / "backbones").exists()
     assert (site / "mtl_bench" / "bench" / "recipes" / "small.toml").is_file()
     assert (site / "mtl_bench" / "report" / "page.html.j2").is_file()
-    assert (site / "mtl_bench" / "figures" / "cloud.html.j2").is_file()
+    assert (site / "mtl_bench" / "show" / "figures" / "cloud.html.j2").is_file()

@@ -107,7 +107,7 @@ def test_shipped_engines_declare_literals_and_what_their_classes_say():
 def test_a_file_called_like_its_package_leaves_the_package_alone(name):
     pytest.importorskip(name)
     engine = engines.load(name)
-    assert engine.__module__.startswith("mtl_bench_plugins_")
+    assert engine.__module__ == f"mtl_bench.deploy.engines.{name}"
     assert "site-packages" in importlib.import_module(name).__file__
 
 
@@ -194,6 +194,7 @@ def test_named_maps_are_those_of_the_contract():
     with torch.inference_mode():
         made = timer.make(subject(), "eager", Setting(1, *SIZE, "fp32", CPU, 1))
         found = made.run(made.transfer(subject().images[0]))
-    assert set(found) == {"logits", "class", "center", "offset", "inverse"}
-    assert found["class"].shape == (1, *SIZE)
-    assert found["offset"].shape == (1, 2, *SIZE)
+    maps = {"semantic", "semantic.class", "center", "offset"}
+    assert set(found) == {f"panoptic.{name}" for name in maps} | {"depth.inverse"}
+    assert found["panoptic.semantic.class"].shape == (1, *SIZE)
+    assert found["panoptic.offset"].shape == (1, 2, *SIZE)
