@@ -9,45 +9,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from launching import FAKE, cells, fake, history, hold
 
 from mtl_bench.bench import launch, store
 from mtl_bench.bench.jobs import CELLS, load_cell
 from mtl_bench.bench.launch import CellRun, duration
 from mtl_bench.cli.display import Lines
-from mtl_bench.core import locks, provenance
+from mtl_bench.core import locks
 from mtl_bench.core.config import Cell, Recipe
-
-FAKE = Path(__file__).parents[1] / "support" / "fake_cell.py"
-
-
-def cells(count):
-    return [Cell(Recipe(), "tiny", "fixed", seed=seed) for seed in range(count)]
-
-
-def fake(runs, action="ok", seconds=0.0, actions=None):
-    """A command that behaves as told, for some seeds (or cells, by id) otherwise."""
-    actions = actions or {}
-
-    def command(cell):
-        code = json.dumps(provenance.code(cell))
-        chosen = actions.get(cell.id, actions.get(cell.seed, action))
-        file = store.run_dir(cell, runs) / "cell.json"
-        return [sys.executable, str(FAKE), chosen, str(seconds), code, str(file)]
-
-    return command
 
 
 def run(todo, runs, jobs=1, rerun=None, **behaviour):
     launcher = launch.Launcher(runs, fake(runs, **behaviour), Lines(quiet=True), jobs, rerun)
     states = launcher.run(todo)
     return [states[cell.id].word for cell in todo]
-
-
-def history(runs):
-    """[(word, slug, time, threads)]"""
-    lines = (runs / "history.txt").read_text().splitlines()
-    fields = [line.split() for line in lines]
-    return [(f[0], f[1], float(f[2]), f[3]) for f in fields]
 
 
 def wait_for(condition, seconds=20.0):
@@ -146,12 +121,6 @@ def test_two_launchers_share_a_grid(tmp_path):
     assert words == [["done"] * 6] * 2
     starts = [slug for word, slug, *_ in history(tmp_path) if word == "start"]
     assert sorted(starts) == sorted(cell.slug for cell in todo)
-
-
-def hold(directory, pid):
-    directory.mkdir(parents=True, exist_ok=True)
-    owner = {"pid": pid, "machine": locks._machine()}
-    (directory / "claim").write_text(json.dumps(owner))
 
 
 @pytest.mark.parametrize(("action", "word"), [("ok", "done"), ("fail", "failed")])
@@ -261,7 +230,7 @@ from pathlib import Path
 from mtl_bench.bench import launch
 from mtl_bench.cli.display import Lines
 sys.path.insert(0, {tests!r})
-from test_launch import cells, fake
+from launching import cells, fake
 
 def interrupt(number, frame):
     raise KeyboardInterrupt

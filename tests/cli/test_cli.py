@@ -8,7 +8,7 @@ import types
 from pathlib import Path
 
 import pytest
-from test_launch import fake, history, hold
+from launching import fake, history, hold
 from typer.testing import CliRunner
 
 from mtl_bench.bench import jobs, store
