@@ -22,15 +22,15 @@ import torch
 
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, load_recipe
-from mtl_bench.data import frame_cache, loader
-from mtl_bench.data import scenes as synthetic
-from mtl_bench.data.cityscapes import Cityscapes
+from mtl_bench.core.task import tasks_of_cell
+from mtl_bench.data import frame_cache, loader, scenes
+from mtl_bench.data.samples import Samples, open_samples
 
 NOISE = 0.62  # of 255, standard deviation
 
 
-def make_tree(out: Path, scenes: int) -> Path:
-    synthetic.write(out, 1024, 2048, scenes, 1, 0, frames=3)
+def make_tree(out: Path, count: int) -> Path:
+    scenes.write(out, 1024, 2048, count, 1, 0, frames=3)
     random, sizes = np.random.default_rng(0), []
     for path in sorted(out.rglob("*_leftImg8bit.png")):
         image = cv2.imread(str(path))
@@ -41,9 +41,9 @@ def make_tree(out: Path, scenes: int) -> Path:
     return out
 
 
-def open_tree(root: Path) -> Cityscapes:
+def open_tree(root: Path) -> Samples:
     cell = Cell(load_recipe("cityscapes"), backbone="", method="")
-    return loader.open_dataset(cell, "train", root, training=True)
+    return open_samples(cell.recipe, tasks_of_cell(cell), "train", root, training=True)
 
 
 def measure(batches: Iterator[Batch], count: int, step_s: float) -> tuple[float, float]:
@@ -62,14 +62,14 @@ def measure(batches: Iterator[Batch], count: int, step_s: float) -> tuple[float,
     return rate, max(1 - count * pause / took, 0)
 
 
-def processor_ms(dataset: Cityscapes, samples: int = 16) -> float:
+def processor_ms(samples: Samples, count: int = 16) -> float:
     """Of one sample, as a worker makes it: with one thread."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     start = time.process_time()
-    for number in range(samples):
-        dataset.sample(number % len(dataset), torch.Generator().manual_seed(number))
-    return 1000 * (time.process_time() - start) / samples
+    for number in range(count):
+        samples.sample(number % len(samples), torch.Generator().manual_seed(number))
+    return 1000 * (time.process_time() - start) / count
 
 
 def main() -> None:
@@ -86,14 +86,15 @@ def main() -> None:
         root = given.data or make_tree(Path(folder) / "tree", given.scenes)
         for cached in (False, True):
             os.environ[frame_cache.PLACE] = str(Path(folder) / "cache")
-            dataset = open_tree(root)
+            samples = open_tree(root)
+            frames = samples.dataset
             if cached:
                 start = time.perf_counter()
-                files = sum(1 for _ in frame_cache.build(dataset.on_disk, dataset.sources(True)))
+                files = sum(1 for _ in frame_cache.build(frames.on_disk, frames.sources()))
                 print(f"cache: {files} files in {time.perf_counter() - start:.1f} s")
-            print(f"one sample: {processor_ms(dataset):.0f} ms of a core", flush=True)
+            print(f"one sample: {processor_ms(samples):.0f} ms of a core", flush=True)
             for workers in map(int, given.workers.split(",")):
-                batches = loader.train_batches(dataset, len(dataset), 0, workers=workers)
+                batches = loader.train_batches(samples, len(samples), 0, workers=workers)
                 rate, share = measure(batches, given.batches, given.step_ms / 1000)
                 what = f"{'with' if cached else 'without'} cache, {workers} workers"
                 waits = f"waits {share:.0%} of the time beside {given.step_ms:.0f} ms steps"

@@ -12,16 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from mtl_bench.tasks.losses import loss_terms
 from torch import Tensor, nn
 
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, load_recipe
-from mtl_bench.core.device import Engine
+from mtl_bench.core.device import Compute
 from mtl_bench.core.terms import Term, gather
-from mtl_bench.data import scenes as synthetic
-from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.data.loader import open_dataset, train_batches
+from mtl_bench.data import scenes
+from mtl_bench.data.loader import train_batches
+from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model
 from mtl_bench.train.backward import Pass, backward, reevaluate
 from mtl_bench.train.loop import build, build_method
@@ -100,20 +99,17 @@ def open_bench(granularity: str, device: torch.device) -> Bench:
     recipe = load_recipe("small")
     data = replace(recipe.data, train_scenes=16, val_scenes=4, frames=3)
     cell = Cell(replace(recipe, data=data), "resnet18", BASE, granularity=granularity)
-    root = synthetic.ensure(data)
-    model, method, _ = build(cell, CITYSCAPES20, Engine(device))
-    pose = model.pose
-    assert pose is not None
+    model, method, _ = build(cell, Compute(device))
     model.train()
-    dataset = open_dataset(cell, "train", root, training=True)
-    batches = itertools.islice(train_batches(dataset, recipe.optim.batch, 0), MOST)
+    samples = open_samples(cell.recipe, model.tasks, "train", scenes.ensure(data), training=True)
+    for task in model.tasks:
+        task.begin(samples.dataset)
+    batches = itertools.islice(train_batches(samples, recipe.optim.batch, 0), MOST)
 
     def forward_of(batch: Batch) -> Callable[[], Pass]:
         def forward() -> Pass:
-            outputs = model.net(batch.image_B3HW)
-            transforms = pose(batch.image_B3HW, batch.context_BN3HW)
-            losses = loss_terms(batch, outputs, transforms, cell.recipe.loss, cell.tasks)
-            return Pass(losses, outputs.representation)
+            outputs = model(batch)
+            return Pass(model.losses(outputs, batch), outputs.representation)
 
         return forward
 
@@ -127,7 +123,7 @@ def open_bench(granularity: str, device: torch.device) -> Bench:
 
 
 def our_step(bench: Bench, name: str) -> Step:
-    method = build_method(replace(bench.cell, method=name)).to(bench.device)
+    method = build_method(replace(bench.cell, method=name), bench.terms).to(bench.device)
     batches = [[forward] for forward in bench.forwards[: method.batches]]
 
     def step() -> None:

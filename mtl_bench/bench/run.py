@@ -18,7 +18,7 @@ from mtl_bench.bench.stored import load_model, time_again, time_cell
 from mtl_bench.core import provenance
 from mtl_bench.core.config import Cell
 from mtl_bench.core.dataset import dataset_of
-from mtl_bench.core.device import Engine, choose_device
+from mtl_bench.core.device import Compute, choose_device
 from mtl_bench.core.files import read_json, replacing, write_json
 from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.samples import open_samples
@@ -63,11 +63,11 @@ def run_cell(
         ValueError: a parent of the cell has no result or no checkpoint, or the data set lacks what
             its evaluation or the video stage needs.
     """
-    engine = Engine(choose_device(device), cell.recipe.optim.precision)
+    compute = Compute(choose_device(device), cell.recipe.optim.precision)
     progress = Progress(run_dir, echo)
     progress.catch_signals()
     tracker = Tracker(wandb, cell, run_dir)
-    code, environment = provenance.code(cell), provenance.environment(engine.device)
+    code, environment = provenance.code(cell), provenance.environment(compute.device)
     write_json(run_dir / "env.json", environment)
 
     tasks = tasks_of_cell(cell)
@@ -78,17 +78,17 @@ def run_cell(
             f"further labels; set video=false"
         )
     if cell.single_task:
-        trained = _trained_apart(cell, run_dir, engine)
+        trained = _trained_apart(cell, run_dir, compute)
     else:
-        trained = _train(cell, run_dir, root, engine, progress, tracker)
+        trained = _train(cell, run_dir, root, compute, progress, tracker)
     model, took = trained.model, trained.time
     echo(f"trained in {took['train_s']:.0f} s ({took['step_ms']:.0f} ms a step)")
 
-    evaluation, eval_s = _evaluate(model, cell, root, engine, progress)
+    evaluation, eval_s = _evaluate(model, cell, root, compute, progress)
     _save_samples(run_dir / "samples.npz", evaluation.samples)
 
     progress.update("latency", 0, 1)
-    timing, latency_s = time_cell(model, cell, root, engine, progress.quiet)
+    timing, latency_s = time_cell(model, cell, root, compute, progress.quiet)
     echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
 
     row = {
@@ -122,9 +122,9 @@ def renew(
         if cell.single_task:
             for parent in cell.parents:
                 _result_of(parent, run_dir.parent)
-        engine = Engine(choose_device(device), cell.recipe.optim.precision)
-        model, progress = load_model(cell, run_dir / CHECKPOINT, engine), Progress(run_dir, echo)
-        evaluation, eval_s = _evaluate(model, cell, root, engine, progress)
+        compute = Compute(choose_device(device), cell.recipe.optim.precision)
+        model, progress = load_model(cell, run_dir / CHECKPOINT, compute), Progress(run_dir, echo)
+        evaluation, eval_s = _evaluate(model, cell, root, compute, progress)
         timing = {k: v for k, v in row["metric"].items() if k.startswith("latency.")}
         before = {k: v for k, v in row["metric"].items() if k not in timing}
         after = {key: evaluation.metrics.get(key) for key in before}
@@ -143,7 +143,7 @@ def renew(
             echo("every metric is that of the row, which is stamped anew")
         else:
             row["time"]["eval_s"] = eval_s
-            row["env_of_evaluation"] = provenance.environment(engine.device)
+            row["env_of_evaluation"] = provenance.environment(compute.device)
             _save_samples(run_dir / "samples.npz", evaluation.samples)
     again = "time" in stale and not older
     row["code"] = {**code, "time": row["code"]["time"]} if again else code
@@ -153,12 +153,12 @@ def renew(
 
 
 def _evaluate(
-    model: Model, cell: Cell, root: Path, engine: Engine, progress: Progress
+    model: Model, cell: Cell, root: Path, compute: Compute, progress: Progress
 ) -> tuple[Evaluation, float]:
     """With the seconds that it took."""
     start = time.perf_counter()
     evaluation = evaluate(
-        model, cell, root, engine.device, progress=lambda n, of: progress.update("evaluate", n, of)
+        model, cell, root, compute.device, progress=lambda n, of: progress.update("evaluate", n, of)
     )
     eval_s = time.perf_counter() - start
     progress.say(f"evaluated in {eval_s:.0f} s: {CELLS.headline(evaluation.metrics)}")
@@ -169,7 +169,7 @@ def _evaluate(
 
 
 def _train(
-    cell: Cell, run_dir: Path, root: Path, engine: Engine, progress: Progress, tracker: Tracker
+    cell: Cell, run_dir: Path, root: Path, compute: Compute, progress: Progress, tracker: Tracker
 ) -> Trained:
     """Train; a video cell goes on from its parent's checkpoint, with labels that this one made."""
     taken: dict[str, Any] = read_json(run_dir / TAKEN) or {}
@@ -177,13 +177,15 @@ def _train(
     protocol = {}
     if cell.video:
         _, start = _result_of(cell.parents[0], run_dir.parent)
-        further_labels, frames = _pseudo_labels(cell, start, root, run_dir, engine, progress, taken)
+        further_labels, frames = _pseudo_labels(
+            cell, start, root, run_dir, compute, progress, taken
+        )
         protocol = {"pseudo_frames": frames}
-    if engine.device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(engine.device)
-    given = (cell, root, run_dir, engine, progress, tracker)
+    if compute.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(compute.device)
+    given = (cell, root, run_dir, compute, progress, tracker)
     model = train(*given, start=start, further_labels=further_labels)
-    taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(engine.device))
+    taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(compute.device))
     write_json(run_dir / TAKEN, taken)
     train_s, step_ms = training_time(run_dir / "curve.csv")
     waited = {"data_share": data_share(run_dir / "curve.csv")}
@@ -195,12 +197,12 @@ def _pseudo_labels(
     parent_checkpoint: Path,
     root: Path,
     run_dir: Path,
-    engine: Engine,
+    compute: Compute,
     progress: Progress,
     taken: dict[str, Any],
 ) -> tuple[Path, int]:
     """Make what labels are missing; their folder and number. `taken` gets the seconds."""
-    model = load_model(cell.parents[0], parent_checkpoint, engine)
+    model = load_model(cell.parents[0], parent_checkpoint, compute)
     counts: list[int] = []  # of labelled frames: at the start, and after each
 
     def note(done: int, of: int) -> None:
@@ -214,7 +216,7 @@ def _pseudo_labels(
     frames = kind.frames_to_label(root, run_dir / "pseudo_labels", "train", cell.recipe)
     task = next(task for task in model.tasks if task.makes_labels)
     with evaluating(model):
-        folder = task.label(model, frames, engine.device, note)
+        folder = task.label(model, frames, compute.device, note)
     made = counts[-1] - counts[0]
     if made:  # a run that was killed here made the others, as fast
         taken["pseudo_s"] = (time.perf_counter() - began) * counts[-1] / made
@@ -223,12 +225,12 @@ def _pseudo_labels(
     return folder, counts[-1]
 
 
-def _trained_apart(cell: Cell, run_dir: Path, engine: Engine) -> Trained:
+def _trained_apart(cell: Cell, run_dir: Path, compute: Compute) -> Trained:
     """The networks of a single-task cell's parents, side by side."""
     times = [_result_of(parent, run_dir.parent)[0]["time"] for parent in cell.parents]
     took = {key: sum(time[key] for time in times) for key in ("train_s", "step_ms")}
     took["peak_mib"] = max(time["peak_mib"] for time in times)
-    return Trained(load_model(cell, run_dir / CHECKPOINT, engine), took, {})
+    return Trained(load_model(cell, run_dir / CHECKPOINT, compute), took, {})
 
 
 def _result_of(parent: Cell, runs: Path) -> tuple[dict[str, Any], Path]:

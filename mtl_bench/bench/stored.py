@@ -13,7 +13,7 @@ from mtl_bench.bench.jobs import load_run
 from mtl_bench.core import provenance
 from mtl_bench.core.batch import collate
 from mtl_bench.core.config import Cell
-from mtl_bench.core.device import Engine, choose_device
+from mtl_bench.core.device import Compute, choose_device
 from mtl_bench.core.files import write_json
 from mtl_bench.core.locks import SIDE_BY_SIDE, Quiet
 from mtl_bench.core.task import Results
@@ -41,11 +41,11 @@ def reevaluate(
     Args:
         export: folder for the panoptic predictions, in Cityscapes' format.
     """
-    engine = Engine(choose_device(device), cell.recipe.optim.precision)
-    model = load_model(cell, checkpoint_path, engine)
+    compute = Compute(choose_device(device), cell.recipe.optim.precision)
+    model = load_model(cell, checkpoint_path, compute)
     if export is not None:
-        export_predictions(model, cell, root, export, engine.device, split)
-    return evaluate(model, cell, root, engine.device, split)
+        export_predictions(model, cell, root, export, compute.device, split)
+    return evaluate(model, cell, root, compute.device, split)
 
 
 def export_predictions(
@@ -71,7 +71,7 @@ def export_predictions(
         raise ValueError(f"no task of cell {cell.slug} has results to export")
 
 
-def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
+def load_model(cell: Cell, path: Path, compute: Compute) -> Model:
     """A cell's model with the weights of a checkpoint.
 
     Args:
@@ -84,9 +84,9 @@ def load_model(cell: Cell, path: Path, engine: Engine) -> Model:
     if cell.single_task:
         paths = [path.parent.parent / parent.slug / CHECKPOINT for parent in cell.parents]
         pairs = zip(cell.parents, paths, strict=True)
-        return side_by_side([load_model(parent, file, engine) for parent, file in pairs])
+        return side_by_side([load_model(parent, file, compute) for parent, file in pairs])
     state = checkpoint.read(path)
-    model = build(cell, engine)[0]
+    model = build(cell, compute)[0]
     try:
         model.load_state_dict(state["model"])
     except RuntimeError as error:
@@ -106,7 +106,7 @@ def deployed(path: Path, tasks: tuple[str, ...] | None) -> tuple[Cell, Model]:
         ValueError: no checkpoint there, or it has not been trained for a task.
     """
     cell, weights = load_run(path)
-    model = load_model(cell, weights, Engine(torch.device("cpu")))
+    model = load_model(cell, weights, Compute(torch.device("cpu")))
     lacking = [task for task in tasks or () if task not in cell.tasks]
     if lacking:
         raise ValueError(f"{path} is trained for {', '.join(cell.tasks)}, not for {lacking[0]}")
@@ -115,7 +115,7 @@ def deployed(path: Path, tasks: tuple[str, ...] | None) -> tuple[Cell, Model]:
 
 
 def time_cell(
-    model: Model, cell: Cell, root: Path, engine: Engine, quiet: Quiet
+    model: Model, cell: Cell, root: Path, compute: Compute, quiet: Quiet
 ) -> tuple[dict[str, Any], float]:
     """The latency protocol over the evaluation split's frames; seconds that it took.
 
@@ -137,8 +137,8 @@ def time_cell(
             images,
             camera,
             recipe.latency,
-            engine.device,
-            engine.precision,
+            compute.device,
+            compute.precision,
         )
         torch.set_num_threads(threads)
         return timing, time.perf_counter() - start
@@ -148,15 +148,15 @@ def time_again(
     cell: Cell, run_dir: Path, root: Path, device: str, echo: Callable[[str], None]
 ) -> None:
     """Replace the latency of a finished cell's row: for one that was taken on a busy machine."""
-    engine = Engine(choose_device(device), cell.recipe.optim.precision)
+    compute = Compute(choose_device(device), cell.recipe.optim.precision)
     code, row = provenance.code(cell)["time"], store.load_row(run_dir)
     assert row is not None
-    model = load_model(cell, run_dir / CHECKPOINT, engine)
-    timing, latency_s = time_cell(model, cell, root, engine, Quiet(run_dir.parent))
+    model = load_model(cell, run_dir / CHECKPOINT, compute)
+    timing, latency_s = time_cell(model, cell, root, compute, Quiet(run_dir.parent))
     row["metric"] |= timing
     row["time"]["latency_s"] = latency_s
     if "time" in row["code"]:  # not so in a row that an older version stamped
         row["code"]["time"] = code
-    row["env_of_latency"] = provenance.environment(engine.device)
+    row["env_of_latency"] = provenance.environment(compute.device)
     write_json(run_dir / "row.json", row)
     echo(f"timed again in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")

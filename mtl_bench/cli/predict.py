@@ -136,12 +136,12 @@ def _predictor(checkpoint: Path, size: tuple[int, int] | None, device: o.Device)
     """The checkpoint's model, ready to be asked."""
     from mtl_bench.bench.jobs import load_run
     from mtl_bench.bench.stored import load_model
-    from mtl_bench.core.device import Engine, choose_device
+    from mtl_bench.core.device import Compute, choose_device
     from mtl_bench.show.predict import Predictor
 
     cell, weights = load_run(checkpoint)
-    engine = Engine(choose_device(device.value), cell.recipe.optim.precision)
-    return Predictor(load_model(cell, weights, engine), cell, engine.device, size)
+    compute = Compute(choose_device(device.value), cell.recipe.optim.precision)
+    return Predictor(load_model(cell, weights, compute), cell, compute.device, size)
 
 
 def _kinds(what: str | None, video: bool, tasks: tuple[str, ...]) -> list[str]:

@@ -73,11 +73,11 @@ def pseudo_label(
 
     from mtl_bench.bench.stored import load_model
     from mtl_bench.core.dataset import dataset_in, dataset_of
-    from mtl_bench.core.device import Engine, choose_device
+    from mtl_bench.core.device import Compute, choose_device
     from mtl_bench.evaluate.walk import evaluating
 
-    engine = Engine(choose_device(device.value), cell.recipe.optim.precision)
-    model = load_model(cell, weights, engine)
+    compute = Compute(choose_device(device.value), cell.recipe.optim.precision)
+    model = load_model(cell, weights, compute)
     maker = next((task for task in model.tasks if task.makes_labels), None)
     if maker is None:
         raise ValueError(f"cell {cell.slug} has no task that makes labels")
@@ -92,7 +92,7 @@ def pseudo_label(
         kind = dataset_in(root) or dataset_of(cell.recipe)
         frames = kind.frames_to_label(root, out, split, cell.recipe)
         with evaluating(model):
-            folder = maker.label(model, frames, engine.device, show)
+            folder = maker.label(model, frames, compute.device, show)
     if not quiet:
         written = counts[-1] - counts[0]
         typer.echo(f"{written} frames written, {counts[0]} there already: {folder}")

@@ -20,7 +20,7 @@ def seed_for(seed: int, purpose: str) -> int:
 
 
 @dataclass
-class Engine:
+class Compute:
     """Where and in which precision a cell runs.
 
     Raises:

@@ -71,7 +71,7 @@ def plugin_root(kind: str, name: str) -> Root:
 
 _MODEL = [
     Root(of_package("model.network"), ("build_model", "side_by_side")),
-    Root(of_package("core.device"), ("Engine",)),
+    Root(of_package("core.device"), ("Compute",)),
     Root(of_package("core.task"), ("tasks_of", "finish")),
 ]
 # Where each stage of a cell begins in this package

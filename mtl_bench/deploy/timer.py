@@ -29,7 +29,7 @@ from torch import Tensor
 
 from mtl_bench.core import config, provenance
 from mtl_bench.core.batch import Batch, Camera
-from mtl_bench.core.device import Engine as Device
+from mtl_bench.core.device import Compute
 from mtl_bench.core.engine import Engine, Setting
 from mtl_bench.deploy import engines, maps, roofline
 from mtl_bench.deploy.agreement import Agreement
@@ -207,7 +207,7 @@ def measure(
     Raises:
         ValueError: no images or no passes.
     """
-    place = Device(torch.device(device), precision)
+    place = Compute(torch.device(device), precision)
     hosts, K_133 = prepare(images, camera.K_B33[0], latency, pin=place.pinned)
     if latency.passes < 1:
         raise ValueError(f"latency.passes must be at least 1, not {latency.passes}")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from mtl_bench.core import plugins
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
-from mtl_bench.core.device import Engine, initial_weights, seed_for
+from mtl_bench.core.device import Compute, initial_weights, seed_for
 from mtl_bench.core.method import Composed, LossMethod, Method
 from mtl_bench.core.task import Task, tasks_of_cell, terms_of
 from mtl_bench.core.terms import Term
@@ -32,7 +32,7 @@ def train(
     cell: Cell,
     root: Path,
     run_dir: Path,
-    engine: Engine,
+    compute: Compute,
     progress: Progress,
     tracker: Tracker,
     *,
@@ -53,12 +53,12 @@ def train(
         Interrupted: a signal asked to stop; the state is saved.
     """
     optim = cell.recipe.optim
-    model, method, optimizer = build(cell, engine)
+    model, method, optimizer = build(cell, compute)
     torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
     path, step = run_dir / CHECKPOINT, 0
     if path.is_file():
         state = checkpoint.read(path)
-        step = checkpoint.restore(state, model, method, optimizer, engine.scaler)
+        step = checkpoint.restore(state, model, method, optimizer, compute.scaler)
         progress.say(f"continuing at step {step} of {optim.steps}")
     elif start is not None:
         checkpoint.restore_weights(checkpoint.read(start), model, method)
@@ -70,16 +70,16 @@ def train(
         task.begin(samples.dataset)
     data_seed, first = seed_for(cell.seed, "data"), step * method.batches
     workers = cell.recipe.data.workers
-    batches = train_batches(samples, optim.batch, data_seed, first, workers, engine.pinned)
+    batches = train_batches(samples, optim.batch, data_seed, first, workers, compute.pinned)
     clipped: list[Tensor] = list(model.parameters())
     model.train()
 
     def save() -> None:
         curve.flush()  # first: the rows up to a checkpoint's step must never be missing
-        checkpoint.save(path, step, model, method, optimizer, engine.scaler)
+        checkpoint.save(path, step, model, method, optimizer, compute.scaler)
 
     def forward(part: Batch) -> Pass:
-        with engine.autocast():
+        with compute.autocast():
             outputs = model(part)
         losses = model.losses(outputs, part)
         check_finite(losses, step)
@@ -92,7 +92,7 @@ def train(
             drawn = [next(batches) for _ in range(method.batches)]
             data_ms = 1000 * (time.perf_counter() - step_start)
             parts = [
-                [partial(forward, part.to(engine.device, engine.channels_last)) for part in split]
+                [partial(forward, part.to(compute.device, compute.channels_last)) for part in split]
                 for split in (batch.split(optim.micro_batch or optim.batch) for batch in drawn)
             ]
             optimizer.zero_grad(set_to_none=True)
@@ -100,12 +100,12 @@ def train(
                 method,
                 parts,
                 model,
-                scale=engine.scaler.get_scale(),
+                scale=compute.scaler.get_scale(),
                 lr=optimizer.param_groups[0]["lr"],
                 cosines=bool(optim.cosine_every) and step % optim.cosine_every == 0,
             )
-            update_norm = norm_of(model.shared_parameters()) / engine.scaler.get_scale()
-            grad_norm = engine.apply_gradients(optimizer, clipped, optim.clip)
+            update_norm = norm_of(model.shared_parameters()) / compute.scaler.get_scale()
+            grad_norm = compute.apply_gradients(optimizer, clipped, optim.clip)
             if method.reevaluates:
                 reevaluate(method, weighting.step, parts[0], model)
             step += 1
@@ -124,7 +124,7 @@ def train(
     return model
 
 
-def build(cell: Cell, engine: Engine) -> tuple[Model, Method, torch.optim.Optimizer]:
+def build(cell: Cell, compute: Compute) -> tuple[Model, Method, torch.optim.Optimizer]:
     """Model, method and optimiser as they are before the first step."""
     optim = cell.recipe.optim
     if optim.batch < 2:
@@ -133,8 +133,8 @@ def build(cell: Cell, engine: Engine) -> tuple[Model, Method, torch.optim.Optimi
     with initial_weights(cell.seed):
         model = build_model(cell, tasks)
     method = build_method(cell, terms_of(tasks, cell.granularity))
-    engine.place(model)
-    method.to(engine.device)
+    compute.place(model)
+    method.to(compute.device)
     heads = list(model.head_parameters())
     in_heads = {id(parameter) for parameter in heads}
     rest = [parameter for parameter in model.parameters() if id(parameter) not in in_heads]

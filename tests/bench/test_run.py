@@ -249,11 +249,11 @@ def test_a_parent_without_a_usable_result_is_one_line(
 
 
 def test_side_by_side_gives_each_networks_outputs(cells, finished):
-    from mtl_bench.core.device import Engine
+    from mtl_bench.core.device import Compute
 
-    engine = Engine(torch.device("cpu"), "fp32")
+    compute = Compute(torch.device("cpu"), "fp32")
     apart, panoptic, depth = (
-        load_model(cells[name], finished / cells[name].slug / "last.pt", engine).eval()
+        load_model(cells[name], finished / cells[name].slug / "last.pt", compute).eval()
         for name in ("apart", "panoptic", "depth")
     )
     image = torch.rand(2, 3, 32, 64)

@@ -11,7 +11,7 @@ from torch import nn
 from mtl_bench.bench.stored import time_cell
 from mtl_bench.core.batch import collate
 from mtl_bench.core.config import Cell, Latency, load_recipe
-from mtl_bench.core.device import Engine
+from mtl_bench.core.device import Compute
 from mtl_bench.core.labels import GROUND
 from mtl_bench.core.locks import Quiet
 from mtl_bench.core.task import tasks_of_cell
@@ -87,7 +87,7 @@ def test_the_depth_scale_is_timed_as_it_is_evaluated(cell_and_root, tmp_path):
 
     depth.finish = spy
     (tmp_path / "runs").mkdir()
-    time_cell(model, cell, root, Engine(CPU), Quiet(tmp_path / "runs"))
+    time_cell(model, cell, root, Compute(CPU), Quiet(tmp_path / "runs"))
     timed = list(seen)
     assert len(timed) >= 2
 

@@ -340,7 +340,7 @@ def names(reached, file):
 
 
 def test_each_stage_has_what_it_runs(reached):
-    assert {"Engine", "initial_weights", "seed_for"} <= names(reached["train"], "core.device")
+    assert {"Compute", "initial_weights", "seed_for"} <= names(reached["train"], "core.device")
     assert "photometric_loss" in names(reached["train"], "tasks.depth.losses")
     assert "label" in names(reached["label"], "tasks.panoptic.pseudo_labels")
     assert "PanopticQuality" in names(reached["evaluate"], "tasks.panoptic.metrics")

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from mtl_bench.cli.app import app
 from mtl_bench.core import canvas
 from mtl_bench.core.config import to_dict
-from mtl_bench.core.device import Engine
+from mtl_bench.core.device import Compute
 from mtl_bench.core.files import write_json
 from mtl_bench.core.plugins import PACKAGE
 from mtl_bench.core.view import Key, View
@@ -196,7 +196,7 @@ def run_dir(tmp_path_factory):
     cell = Cell(load_recipe("smoke"), backbone="tiny", method="fixed_uncertainty")
     folder = tmp_path_factory.mktemp("runs") / cell.slug
     folder.mkdir()
-    model = build(cell, Engine(torch.device("cpu"), "fp32"))[0]
+    model = build(cell, Compute(torch.device("cpu"), "fp32"))[0]
     torch.save({"format": checkpoint.FORMAT, "model": model.state_dict()}, folder / "last.pt")
     write_json(folder / "cell.json", to_dict(cell))
     return folder

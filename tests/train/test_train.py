@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from mtl_bench.core.config import Optim, to_dict
-from mtl_bench.core.device import Engine, choose_device, seed_for
+from mtl_bench.core.device import Compute, choose_device, seed_for
 from mtl_bench.core.files import write_json
 from mtl_bench.data.loader import train_batches
 from mtl_bench.train import checkpoint
@@ -29,7 +29,7 @@ def run(cell, root: Path, run_dir: Path, progress=None, **options):
     run_dir.mkdir(exist_ok=True)
     progress = progress or Progress(run_dir, lambda line: None)
     tracker = Tracker("off", cell, run_dir)
-    return train(cell, root, run_dir, Engine(CPU), progress, tracker, **options)
+    return train(cell, root, run_dir, Compute(CPU), progress, tracker, **options)
 
 
 def curve(run_dir: Path) -> list[dict[str, str]]:
@@ -66,7 +66,7 @@ import json, os, signal, sys
 from pathlib import Path
 import torch
 from mtl_bench.core.config import Cell, from_dict
-from mtl_bench.core.device import Engine
+from mtl_bench.core.device import Compute
 from mtl_bench.train.progress import Progress
 from mtl_bench.train.tracking import Tracker
 from mtl_bench.train.loop import train
@@ -78,7 +78,7 @@ class Dies(Progress):
 
 run_dir, root = Path(sys.argv[1]), Path(sys.argv[2])
 cell = from_dict(Cell, json.loads((run_dir / "cell.json").read_text()))
-train(cell, root, run_dir, Engine(torch.device("cpu")), Dies(run_dir, print),
+train(cell, root, run_dir, Compute(torch.device("cpu")), Dies(run_dir, print),
       Tracker("off", cell, run_dir))
 """
 
@@ -204,7 +204,7 @@ def test_nan_stops_with_the_terms_name(smoke_cell, smoke_root, tmp_path, with_op
 
 def test_learning_rates_of_the_three_groups(smoke_cell, with_optim):
     cell = with_optim(smoke_cell, lr=1e-4, head_lr_factor=10.0, method_lr=3e-4, weight_decay=0.1)
-    model, method, optimizer = build(cell, Engine(CPU))
+    model, method, optimizer = build(cell, Compute(CPU))
     by_parameter = {id(p): group for group in optimizer.param_groups for p in group["params"]}
     heads = {id(p) for p in model.head_parameters()}
     for parameter in model.parameters():
@@ -224,9 +224,9 @@ def test_schedule_is_the_papers():
 
 def test_engine_refuses_what_it_cannot_do():
     with pytest.raises(ValueError, match="fp16 trains on CUDA only"):
-        Engine(CPU, "fp16")
+        Compute(CPU, "fp16")
     with pytest.raises(ValueError, match="no precision 'fp8'"):
-        Engine(CPU, "fp8")
+        Compute(CPU, "fp8")
     with pytest.raises(ValueError, match="no device 'tpu'"):
         choose_device("tpu")
     if not torch.cuda.is_available():
@@ -254,10 +254,10 @@ def test_damaged_checkpoint_is_named(tmp_path):
 def test_bfloat16_trains(smoke_cell, smoke_root, tmp_path):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
-    engine = Engine(CPU, "bf16")
+    compute = Compute(CPU, "bf16")
     progress = Progress(run_dir, print)
     tracker = Tracker("off", smoke_cell, run_dir)
-    train(smoke_cell, smoke_root, run_dir, engine, progress, tracker)
+    train(smoke_cell, smoke_root, run_dir, compute, progress, tracker)
     assert all(t.isfinite().all() for t in states(run_dir).values() if t.is_floating_point())
 
 
@@ -341,4 +341,4 @@ def test_without_labels_depth_is_masked_automatically(smoke_cell, smoke_root, tm
 
 def test_two_loss_methods_do_not_compose(smoke_cell):
     with pytest.raises(ValueError, match="is not a loss-value method"):
-        build(replace(smoke_cell, method="fixed+uncertainty"), Engine(CPU))
+        build(replace(smoke_cell, method="fixed+uncertainty"), Compute(CPU))

@@ -10,7 +10,7 @@ from mtl_bench.bench.jobs import load_run
 from mtl_bench.bench.stored import load_model
 from mtl_bench.core.config import Cell, did_you_mean
 from mtl_bench.core.dataset import dataset_in, layouts
-from mtl_bench.core.device import Engine, choose_device
+from mtl_bench.core.device import Compute, choose_device
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.data.cameras import Mounted
 from mtl_bench.show.predict import Predicted, Predictor
@@ -35,8 +35,8 @@ def load(run: Path, device: str = "auto") -> Predictor:
         ValueError: nothing there, or no readable checkpoint.
     """
     cell, weights = load_run(run)
-    engine = Engine(choose_device(device), cell.recipe.optim.precision)
-    return Predictor(load_model(cell, weights, engine), cell, engine.device)
+    compute = Compute(choose_device(device), cell.recipe.optim.precision)
+    return Predictor(load_model(cell, weights, compute), cell, compute.device)
 
 
 def frames_in(root: Path, split: str) -> dict[str, Path]:
