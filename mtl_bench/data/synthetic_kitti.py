@@ -1,4 +1,7 @@
-"""The built-in scenes in KITTI's layout."""
+"""The built-in scenes in KITTI's layout.
+
+Source: `scenes/`, rendered into the user's cache by seed and number of the scene.
+"""
 
 from pathlib import Path
 from typing import ClassVar
