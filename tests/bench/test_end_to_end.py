@@ -156,6 +156,7 @@ def test_the_papers_ablation_runs_from_one_command(ablated):
     assert sorted(names, key=table.index) == names
 
 
+@pytest.mark.slow
 def test_an_ablation_killed_anywhere_ends_with_the_same_rows(ablated, smoke_root):
     words = ablation(ablated, smoke_root, "killed")
     process = subprocess.Popen(
