@@ -1,10 +1,10 @@
 """Fingerprints of the code that a stage runs, blind to where it stands and how it is worded.
 
-The code is what can be reached from a stage's roots: the top-level definitions that they name, those
-that these name, and so on, through imports of this package and of plug-in helpers. Each counts by
-its syntax tree without comments, docstrings, annotations and imports, and a fingerprint is of the
-sorted set of them. So a definition may be moved, reordered, reworded or imported in another way;
-what it does may not change unseen. Nothing is imported: files are read as text.
+The code is what can be reached from a stage's roots: the top-level definitions that they name,
+those that these name, and so on, through imports of this package and of plug-in helpers. Each
+counts by its syntax tree without comments, docstrings, annotations and imports, and a fingerprint
+is of the sorted set of them. So a definition may be moved, reordered, reworded or imported in
+another way; what it does may not change unseen. Nothing is imported: files are read as text.
 
 A class of which only some members belong to a stage says so, for itself and its subclasses:
 
@@ -28,13 +28,19 @@ NAME = "mtl_bench"
 HARNESS = "harness"
 # Rooms and modules that make no numbers. They parse, keep, tell and show; the values of a recipe
 # stand in the cell's id.
-EXCLUDED = frozenset(
-    "config recipe plain plugins provenance fingerprint files progress quiet claim tracking curve "
-    "results cli commands report render show".split()
-)
+EXCLUDED = {
+    *("config", "recipe", "plain", "plugins", "provenance", "fingerprint", "files", "progress"),
+    *("quiet", "claim", "tracking", "curve", "results", "cli", "commands", "report", "render"),
+    "show",
+}
 MEMBERS = "stage_members"
 SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
+INNER = (*SCOPES, *COMPREHENSIONS, ast.ClassDef, ast.Constant, ast.expr_context)
+NAMED = (
+    *(ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef),
+    *(ast.ExceptHandler, ast.MatchAs, ast.MatchStar),
+)
 DROPPED = {"ctx", "type_comment", "kind", "type_params", "returns", "simple", "type_ignores"}
 
 
@@ -85,16 +91,17 @@ def fingerprints(stage: str, roots: Iterable[Root]) -> dict[str, str]:
     Raises:
         ValueError: a file that is no Python, or a root that it does not define.
     """
-    roots = tuple(roots)
-    kept = _kept.get((stage, roots))
-    if kept is None or any(_stamp(path) != stamp for path, stamp in kept[0].items()):
-        reached = reach(stage, roots)
-        stamps = {path: _stamp(path) for path, _ in reached}
-        kept = _kept[stage, roots] = stamps, _by_part(reached, roots)
-    return kept[1]
+    if any(_stamp(path) != stamp for path, (stamp, _) in _modules.items()):  # edited since
+        _modules.clear()
+        _known.clear()
+    key = stage, tuple(roots)
+    if key not in _known:
+        _known[key] = _by_part(reach(*key), key[1])
+    return _known[key]
 
 
-_kept: dict[tuple[str, tuple[Root, ...]], tuple[dict[Path, Any], dict[str, str]]] = {}
+_modules: "dict[Path, tuple[tuple[int, int] | None, Module]]" = {}
+_known: dict[tuple[str, tuple[Root, ...]], dict[str, str]] = {}
 
 
 def _by_part(reached: "dict[tuple[Path, str], tuple[str, Code]]", roots: tuple[Root, ...]) -> Any:
@@ -139,6 +146,7 @@ def reach(stage: str, roots: Iterable[Root]) -> dict[tuple[Path, str], tuple[str
     return found
 
 
+@lru_cache(maxsize=4096)
 def room(path: Path) -> str | None:
     """The room (or module at the top, or in core/) of a file of this package; None: a plug-in."""
     if not path.is_relative_to(PACKAGE) or path.is_relative_to(PACKAGE / "_shipped"):
@@ -196,14 +204,13 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 
 def load(path: Path) -> "Module":
-    return _load(path, _stamp(path))
+    """A file as it was when this process first saw it, or saw that any had been edited."""
+    if path not in _modules:
+        _modules[path] = _stamp(path), Module(path)
+    return _modules[path][1]
 
 
-@lru_cache(maxsize=1024)
-def _load(path: Path, stamp: tuple[int, int] | None) -> "Module":
-    return Module(path)
-
-
+@lru_cache(maxsize=4096)
 def _module_file(place: Path) -> Path | None:
     """The file of a module whose path without suffix this is."""
     for path in (place.with_name(f"{place.name}.py"), place / "__init__.py"):
@@ -234,7 +241,8 @@ class Module:
             self._see(statement)
 
     def _see(self, statement: ast.stmt) -> None:
-        for node in _same_scope([statement]):
+        nodes = _same_scope([statement])
+        for node in nodes:
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 self.imports |= imported(node, self.path)
                 if isinstance(node, ast.ImportFrom) and node.names[0].name == "*":
@@ -248,7 +256,7 @@ class Module:
             "__name__ == '__main__'",
         ):
             return
-        names = bound([statement])
+        names = bound(nodes)
         for name in names:
             self.statements.setdefault(name, []).append(statement)
         if not names:
@@ -275,11 +283,12 @@ class Module:
             return None
         found: dict[str, set[str]] | None = None
         for target in [Target(self.path, name), *_bases(self.path, name)]:
-            assert target.path is not None and target.name is not None
+            assert target.path is not None
+            assert target.name is not None
             statement = load(target.path).statements[target.name][-1]
             for member in statement.body if isinstance(statement, ast.ClassDef) else []:
                 value = getattr(member, "value", None)
-                if MEMBERS in bound([member]) and value is not None:
+                if MEMBERS in bound(_same_scope([member])) and value is not None:
                     found = found or {}
                     for stage, names in ast.literal_eval(value).items():
                         found.setdefault(stage, set()).update(names)
@@ -289,9 +298,10 @@ class Module:
         """A class with the members that count for a stage."""
         statement = self.statements[name][-1]
         declared = self._stages_of(name)
-        assert isinstance(statement, ast.ClassDef) and declared is not None
-        members = [m for m in statement.body if MEMBERS not in bound([m])]
-        named = {id(m): bound([m]) for m in members}
+        assert isinstance(statement, ast.ClassDef)
+        assert declared is not None
+        members = [m for m in statement.body if MEMBERS not in bound(_same_scope([m]))]
+        named = {id(m): bound(_same_scope([m])) for m in members}
         mentions = {
             id(m): {n.attr for n in ast.walk(m) if isinstance(n, ast.Attribute)}
             | {n.id for n in ast.walk(m) if isinstance(n, ast.Name)}
@@ -366,23 +376,27 @@ def _base(node: ast.ImportFrom, path: Path) -> Path | None:
     return of_package(".".join(words[1:])) if words[:1] == [NAME] else None
 
 
-def _same_scope(body: Iterable[ast.AST]) -> Iterator[ast.AST]:
+def _same_scope(body: Iterable[ast.AST]) -> list[ast.AST]:
     """The nodes of statements without what is inside functions, classes and comprehensions."""
-    for node in body:
-        yield node
-        if not isinstance(node, (*SCOPES, *COMPREHENSIONS, ast.ClassDef)):
-            yield from _same_scope(ast.iter_child_nodes(node))
+    nodes = list(body)
+    for node in nodes:  # which grows meanwhile
+        if not isinstance(node, INNER):
+            for name in node._fields:
+                value = getattr(node, name, None)
+                if isinstance(value, ast.AST):
+                    nodes.append(value)
+                elif isinstance(value, list):
+                    nodes += [item for item in value if isinstance(item, ast.AST)]
+    return nodes
 
 
-def bound(body: Iterable[ast.AST]) -> set[str]:
-    """The names that statements bind in their scope, imports apart."""
+def bound(nodes: Iterable[ast.AST]) -> set[str]:
+    """The names that nodes bind, imports apart."""
     names, elsewhere = set(), set()
-    for node in _same_scope(body):
+    for node in nodes:
         if isinstance(node, ast.Name) and isinstance(node.ctx, (ast.Store, ast.Del)):
             names.add(node.id)
-        elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-            names.add(node.name)
-        elif isinstance(node, (ast.ExceptHandler, ast.MatchAs, ast.MatchStar)) and node.name:
+        elif isinstance(node, NAMED) and node.name is not None:
             names.add(node.name)
         elif isinstance(node, ast.MatchMapping) and node.rest:
             names.add(node.rest)
@@ -421,13 +435,14 @@ class _Normal:
         elif not isinstance(node, ast.AST):
             self.text.append(f"{type(node).__name__} {node!r},")
         elif isinstance(node, (ast.Import, ast.ImportFrom)) or _is_text(node):
-            return
-        elif isinstance(node, (ast.Name, ast.Attribute)) and self._dotted(node):
-            return
+            pass
+        elif isinstance(node, (ast.Name, ast.Attribute)):
+            if not self._dotted(node):
+                self._fields(node)
         elif isinstance(node, SCOPES):
             self._function(node)
         elif isinstance(node, COMPREHENSIONS):
-            targets = bound(generator.target for generator in node.generators)
+            targets = bound(_same_scope(generator.target for generator in node.generators))
             self.scopes.append(dict.fromkeys(targets))
             self._fields(node)
             self.scopes.pop()
@@ -458,8 +473,9 @@ class _Normal:
         for annotation in [*(a.annotation for a in every), getattr(node, "returns", None)]:
             self._follow(annotation)
         body = node.body if isinstance(node.body, list) else [node.body]
-        local: dict[str, Target | None] = dict.fromkeys([*(a.arg for a in every), *bound(body)])
-        for inner in _same_scope(body):
+        nodes = _same_scope(body)
+        local: dict[str, Target | None] = dict.fromkeys([*(a.arg for a in every), *bound(nodes)])
+        for inner in nodes:
             if isinstance(inner, (ast.Import, ast.ImportFrom)):
                 local |= imported(inner, self.module.path)
         self.text.append(f"{type(node).__name__} {getattr(node, 'name', '')}(")
