@@ -234,7 +234,7 @@ def test_a_parent_without_a_usable_result_is_one_line(
             (tmp_path / parent.slug / name).write_bytes(content)
         if not gone:
             row = results.load_row(tmp_path / parent.slug)
-            row["code"]["harness"] = "another"
+            row["code"]["train"]["harness"] = "another"
             (tmp_path / parent.slug / "row.json").write_text(json.dumps(row))
     slug = cells[child].parents[0].slug
     with pytest.raises(ValueError, match=rf"this cell needs .*{slug}, which is {word}.*: run") as e:
