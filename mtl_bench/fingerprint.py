@@ -124,11 +124,10 @@ def reach(stage: str, roots: Iterable[Root]) -> dict[tuple[Path, str], tuple[str
     entered: set[Path] = set()
     own = {root.path: root.part for root in reversed(tuple(roots))}
     for root in roots:
-        module = load(root.path)
         left = [(root.part, Target(root.path, name)) for name in root.names or _classes(root)]
-        for name in root.names:
-            if name not in module.statements:
-                raise ValueError(f"{root.path} defines no '{name}'")
+        for _, target in left:
+            if not any(_definitions(target)):
+                raise ValueError(f"{root.path} defines no '{target.name}'")
         while left:
             origin, target = left.pop()
             for path, name in _definitions(target):
