@@ -359,7 +359,12 @@ def train(tmp_path, monkeypatch):
         return call("train", *words, code=code)
 
     run.behave, run.seen = (lambda directory: None), seen
-    module.run_cell = run_cell
+
+    def renew(cell, directory, root, device, echo):
+        run.renewed.append(cell)
+
+    run.renewed = []
+    module.run_cell, module.renew = run_cell, renew
     monkeypatch.setitem(sys.modules, "mtl_bench.run", module)
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
     return run
@@ -420,6 +425,24 @@ def test_train_does_not_build_on_a_stale_parent(train, change_harness):
         in text
     )
     assert len(train.seen) == 1
+
+
+def test_train_stale_trains_only_where_training_is_concerned(train, change_harness):
+    train(*CELL)
+    cell = train.seen[0][0]
+    directory = Path("runs") / cell.slug
+    assert "done already" in train(*CELL, "--stale")
+    (directory / "last.pt").write_text("state")
+    change_harness("evaluate")
+    assert "done already, but stale: evaluate: harness changed (--rerun" in train(*CELL)
+    train(*CELL, "--stale")
+    assert (train.renewed, len(train.seen)) == ([cell], 1)
+    change_harness("train")
+    assert "starting over (train: harness changed" in train(*CELL, "--stale")
+    assert (train.renewed, len(train.seen)) == ([cell], 2)
+    aside = directory / "set-aside-1"
+    assert (aside / "last.pt").read_text() == "state"
+    assert (aside / "row.json").is_file()
 
 
 def test_train_writes_down_why_it_failed(train):
