@@ -434,7 +434,7 @@ def test_train_stale_trains_only_where_training_is_concerned(train, change_harne
     assert "done already" in train(*CELL, "--stale")
     (directory / "last.pt").write_text("state")
     change_harness("evaluate")
-    assert "done already, but stale: evaluate: harness changed (--rerun" in train(*CELL)
+    assert "done already, but stale: evaluate: harness changed (--stale" in train(*CELL)
     train(*CELL, "--stale")
     assert (train.renewed, len(train.seen)) == ([cell], 1)
     change_harness("train")
