@@ -232,6 +232,7 @@ class Module:
         self.stars: list[Path] = []
         self.effects: list[ast.stmt] = []  # what runs on import and defines nothing
         self._codes: dict[tuple[str, str], Code] = {}
+        self._stages: dict[str, dict[str, set[str]] | None] = {}
         try:
             tree = ast.parse(path.read_bytes(), str(path))
         except (SyntaxError, ValueError) as error:  # ValueError: null bytes
@@ -267,7 +268,9 @@ class Module:
             stage, body = "", [self.effects[int(name[1:])]]
         else:
             body = self.statements[name]
-        shared = self._stages_of(name) is None
+        if name not in self._stages:
+            self._stages[name] = self._stages_of(name)
+        shared = self._stages[name] is None
         key = name, "" if shared else stage
         if key not in self._codes:
             normal = _Normal(self)

@@ -14,7 +14,7 @@ from mtl_bench import plugins
 PACKAGE = plugins.PACKAGE
 MODULES = sorted(PACKAGE.rglob("*.py"))
 LINES = 300
-LONG = {"fingerprint.py": 500}  # one idea, and longer
+LONG = {"fingerprint.py": 600}  # one idea, and longer
 
 # A module imports only from rooms before its own (or from its own).
 ORDER = (
