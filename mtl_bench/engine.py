@@ -5,6 +5,7 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +26,8 @@ class Engine:
     Raises:
         ValueError: CUDA asked for where there is none, or fp16 on the CPU.
     """
+
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"train": ("apply_gradients", "pinned")}
 
     device: torch.device
     precision: str = "fp32"

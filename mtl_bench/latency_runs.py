@@ -20,8 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from mtl_bench import claim, launch, plugins, provenance, results
+from mtl_bench import claim, engines, launch, provenance, results
 from mtl_bench.config import Recipe
+from mtl_bench.fingerprint import Root, fingerprints, of_package
 from mtl_bench.plain import to_dict
 from mtl_bench.quiet import Quiet
 from mtl_bench.timing import Timing
@@ -29,10 +30,6 @@ from mtl_bench.timing import Timing
 Word = Literal["done", "stale", "wrong", "failed", "unavailable", "missing"]
 WORDS: tuple[Word, ...] = get_args(Word)
 BAD = ("wrong", "failed", "missing")  # what makes `ablate` end with 1; an engine may be absent
-MEASURES = (  # what a time depends on beside the backbone
-    *("model", "engines", "engine.py", "latency.py", "deploy.py", "pixels.py", "grouping.py"),
-    *("postprocess.py", "finish.py", "depth_scale.py", "geometry.py"),
-)
 AGAIN: dict[str | None, tuple[Word, ...]] = {  # --rerun: what is timed again beside what lacks
     None: (),
     "failed": ("wrong",),
@@ -260,19 +257,28 @@ def _neighbours(runs: Path) -> bool:
 # --- what made a row ------------------------------------------------------------------------------
 
 
-def _code(timing: Timing) -> dict[str, str]:
-    return {
-        "backbone": plugins.fingerprint("backbones", timing.backbone),
-        "harness": provenance.harness_fingerprint(names=MEASURES),
-    }
+def roots(timing: Timing) -> list[Root]:
+    """Of its network and frames only shapes count: training and data sets do not."""
+    module, engine = engines.CLASSES[timing.engine]
+    return [
+        provenance.backbone_root(timing.backbone),
+        Root(of_package("engines.timed"), ("row",)),
+        Root(of_package(f"engines.{module}"), (engine,)),
+        Root(of_package("deploy"), ("name_classes", "_camera", "_only")),
+        Root(of_package("latency"), ("prepare",)),
+        Root(of_package("model"), ("build_model", "side_by_side")),
+    ]
 
 
-def _changed(before: Mapping[str, str], timing: Timing) -> str:
+def _code(timing: Timing) -> provenance.Code:
+    return {"time": fingerprints("time", roots(timing))}
+
+
+def _changed(before: Mapping[str, Any], timing: Timing) -> str:
     """What changed since fingerprints were taken, in words; empty for nothing."""
     try:
         now = _code(timing)
     except ValueError as error:  # a plug-in that has gone, or has a double now
         return str(error)
     words = {"backbone": f"backbones/{timing.backbone}.py", "harness": "harness"}
-    different = [words[key] for key in words if before.get(key) != now[key]]
-    return f"{', '.join(different)} changed" if different else ""
+    return provenance.in_words(provenance.changes(before, now, words))

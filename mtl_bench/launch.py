@@ -36,7 +36,8 @@ def to_run(cells: Iterable[Cell], runs: Path, rerun: str | None = None) -> list[
     """The cells without a result, those asked for again, and before them what they need.
 
     Args:
-        rerun: `stale`: also those whose code changed. `failed`: those that failed begin at step 0
+        rerun: `stale`: also those whose code changed, each from the first stage on that this
+            concerns. `failed`: those that failed begin at step 0
             rather than at their checkpoint. `all`: every cell, from step 0. `latency`: of those
             that are done, only the latency.
     """
@@ -134,7 +135,7 @@ class Launcher:
         """What keeps a cell from ever running: a parent without a result that may be used."""
         for parent in job.cell.parents:
             state = results.inspect(parent, self.runs)
-            if state.word != "done":
+            if not state.trained:
                 remedy = "; --rerun stale" if state.word == "stale" else ""
                 why = f" ({state.why}{remedy})" if state.why else ""
                 return f"needs {parent.slug}, which is {state.word}{why}"
@@ -154,9 +155,9 @@ class Launcher:
 
     def _start(self, job: Job, state: results.State) -> None:
         timed = self.rerun == "latency" and state.row is not None
-        fresh = self.rerun == "all" or state.word == "stale" or self.rerun == state.word == "failed"
-        if fresh and not timed:
+        if self.rerun == "all" or self.rerun == state.word == "failed":
             results.clear(job.directory)
+        renewed = self.rerun == state.word == "stale"
         job.directory.mkdir(parents=True, exist_ok=True)
         for left_over in ("failed.json", "progress.json"):
             (job.directory / left_over).unlink(missing_ok=True)
@@ -164,7 +165,7 @@ class Launcher:
         job.began, job.progress = time.monotonic(), {}
         with (job.directory / "log.txt").open("ab") as log:
             job.process = subprocess.Popen(
-                [*self.command(job.cell), *(["--latency"] if timed else [])],
+                [*self.command(job.cell), *["--latency"] * timed, *["--stale"] * renewed],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -194,9 +195,12 @@ class Launcher:
         if code in INTERRUPTED:
             return results.State("interrupted", f"stopped by a signal (exit code {code})")
         failure = job.directory / "failed.json"
-        if (code or not (job.directory / "row.json").is_file()) and not failure.is_file():
+        kept = (job.directory / "row.json").is_file()
+        if (code or not kept) and not failure.is_file():
             log = (job.directory / "log.txt").read_text(errors="replace")
             results.write_failure(job.directory, explain_exit(code, log), log, code)
+        if code and kept:  # of a row that was to be renewed
+            return results.State("failed", str(results.read_json(failure)["error"]))
         return results.stored(job.cell, self.runs)
 
     def _end(self, job: Job, state: results.State, how: str = "") -> None:

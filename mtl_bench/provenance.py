@@ -1,45 +1,22 @@
 """What made a row: code fingerprints, versions, device. No host names, user names or paths."""
 
-import hashlib
 import os
 import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from mtl_bench import plugins
 from mtl_bench.config import Cell
+from mtl_bench.fingerprint import Root, fingerprints, of_package
 
 PACKAGE = Path(__file__).resolve().parent
-HARNESS = (  # what numbers depend on; the rest launches, stores or shows
-    "data",
-    "model",
-    "losses",
-    "metrics",
-    "method.py",
-    "jacobian.py",
-    "gradients.py",
-    "weighting.py",
-    "by_gradients.py",
-    "backward.py",
-    "engine.py",
-    "geometry.py",
-    "depth_scale.py",
-    "pixels.py",
-    "grouping.py",
-    "postprocess.py",
-    "finish.py",
-    "train.py",
-    "protocols.py",
-    "collector.py",
-    "evaluate.py",
-    "pseudo_frames.py",
-    "pseudo_labels.py",
-    "latency.py",
-)
+STAMPED_BEFORE = "stamped by an older version"
+NOT_REPRODUCED = "its checkpoint does not give its row's metrics"
 PACKAGES = (
     "mtl-bench",
     "torch",
@@ -51,24 +28,71 @@ PACKAGES = (
 )
 
 
-def code(cell: Cell) -> dict[str, str]:
-    """Fingerprints of the code that a cell's numbers depend on: method, backbone, harness."""
+Code = dict[str, dict[str, str]]  # stage -> part -> fingerprint
+
+
+def code(cell: Cell) -> Code:
+    """Fingerprints of the code that each stage of a cell uses, by method, backbone and harness.
+
+    Raises:
+        ValueError: a plug-in that is not there, or is no Python.
+    """
+    methods = [
+        Root(plugins.path_of("methods", name), part="method", base="Method")
+        for name in plugins.part_names(cell.method)
+    ]
+    given = [*methods, backbone_root(cell.backbone)]
     return {
-        "method": plugins.fingerprint("methods", cell.method),
-        "backbone": plugins.fingerprint("backbones", cell.backbone),
-        "harness": harness_fingerprint(),
+        stage: fingerprints(stage, [*(given if stage == "train" else given[-1:]), *roots])
+        for stage, roots in harness_roots(cell.video).items()
     }
 
 
-def harness_fingerprint(package: Path = PACKAGE, names: tuple[str, ...] = HARNESS) -> str:
-    """12 hexadecimal digits of the modules that produce numbers."""
-    digest = hashlib.sha256()
-    for name in names:
-        paths = sorted((package / name).rglob("*.py")) or [package / name]
-        for path in filter(Path.is_file, paths):
-            digest.update(path.relative_to(package).as_posix().encode() + b"\0")
-            digest.update(path.read_bytes().replace(b"\r\n", b"\n") + b"\0")
-    return digest.hexdigest()[:12]
+def backbone_root(name: str) -> Root:
+    return Root(plugins.path_of("backbones", name), part="backbone", base="Backbone")
+
+
+def harness_roots(video: bool = False) -> dict[str, list[Root]]:
+    """Where each stage of a cell begins in this package."""
+    model = [
+        Root(of_package("model"), ("build_model", "side_by_side")),
+        Root(of_package("engine"), ("Engine",)),
+        Root(of_package("data.labels"), ("labels_of",)),
+    ]
+    train = [Root(of_package("train"), ("train",))]
+    train += [Root(of_package("pseudo_labels"), ("ensure",))] if video else []
+    return {
+        "train": [*train, *model],
+        "evaluate": [Root(of_package("evaluate"), ("evaluate",)), *model],
+        "time": [Root(of_package("stored"), ("time_cell",)), *model],
+    }
+
+
+def changes(before: Mapping[str, Any], now: Code, words: Mapping[str, str]) -> dict[str, str]:
+    """Stage -> what of its code changed since `before` was taken, in words; empty for nothing.
+
+    Args:
+        words: part -> how it is called.
+    """
+    if not all(isinstance(before.get(stage), Mapping) for stage in now):
+        return dict.fromkeys(now, STAMPED_BEFORE)
+    found = {}
+    for stage, parts in now.items():
+        different = [words[part] for part in parts if before[stage].get(part) != parts[part]]
+        if different:
+            unknown = not before[stage]
+            found[stage] = NOT_REPRODUCED if unknown else f"{', '.join(different)} changed"
+    return found
+
+
+def in_words(changed: Mapping[str, str]) -> str:
+    """`train: methods/mine.py changed; evaluate, time: harness changed`"""
+    if set(changed.values()) == {STAMPED_BEFORE}:
+        return STAMPED_BEFORE
+    stages: dict[str, list[str]] = {}
+    for stage, why in changed.items():
+        stages.setdefault(why, []).append(stage)
+    return "; ".join(f"{', '.join(names)}: {why}" for why, names in stages.items())
 
 
 def environment(device: Any = "cpu") -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 runs/<method>-<backbone>-s<seed>-<id>/
     cell.json      what to run, whole
-    code.json      fingerprints of the code that began it: a checkpoint is continued by no other
+    code.json      fingerprints of the code that began it, by stage: a checkpoint is continued by
+                   no other code for training
     claim          who is running it now
     progress.json  how far that is
     last.pt        checkpoint          curve.csv  losses, weights, rate per step
@@ -11,6 +12,7 @@ runs/<method>-<backbone>-s<seed>-<id>/
     log.txt        what the run printed
     row.json       the result; it appears by rename at the very end, so it exists = done
     failed.json    why there is none
+    set-aside-N/   an earlier training, by code that has changed since
 """
 
 import json
@@ -18,7 +20,7 @@ import os
 import shutil
 import threading
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
@@ -26,6 +28,7 @@ from typing import Any, Literal, get_args
 from mtl_bench import plugins, provenance
 from mtl_bench.claim import claimed_by
 from mtl_bench.config import Cell, from_dict, to_dict
+from mtl_bench.fingerprint import STAGES
 
 Word = Literal["done", "stale", "failed", "interrupted", "running", "missing"]
 WORDS: tuple[Word, ...] = get_args(Word)
@@ -36,6 +39,8 @@ HEADLINES = (  # metric, title, digits
     ("depth_median.abs_rel", "AbsRel", 3),
     ("latency.fps", "FPS", 1),
 )
+TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
+ASIDE = "set-aside-"
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
 
 
@@ -44,6 +49,12 @@ class State:
     word: Word
     why: str = ""
     row: dict[str, Any] | None = None
+    stale: Mapping[str, str] = field(default_factory=dict)  # stage -> what of its code changed
+
+    @property
+    def trained(self) -> bool:
+        """Whether its training is done, by the code of today."""
+        return self.word in ("done", "stale") and "train" not in self.stale
 
     @property
     def headline(self) -> str:
@@ -119,8 +130,7 @@ def stored(cell: Cell, runs: Path) -> State:
     directory = run_dir(cell, runs)
     row = load_row(directory)
     if row is not None:
-        why = changed(row.get("code", {}), cell)
-        return State("stale" if why else "done", why, row)
+        return state_of(row, cell)
     failure = read_json(directory / "failed.json")
     if failure is not None:
         return State("failed", str(failure.get("error", "")))
@@ -129,19 +139,27 @@ def stored(cell: Cell, runs: Path) -> State:
     return State("missing")
 
 
-def changed(before: dict[str, str], cell: Cell) -> str:
-    """What changed since fingerprints were taken, in words; empty for nothing."""
+def state_of(row: dict[str, Any], cell: Cell) -> State:
+    """The status of a cell that has a row."""
     try:
-        now = provenance.code(cell)
-    except ValueError as error:  # a plug-in that has gone, or has a double now
-        return str(error)
+        stale = changed(row.get("code", {}), cell)
+    except ValueError as error:  # a plug-in that has gone, has a double now, or is no Python
+        return State("stale", str(error), row, dict.fromkeys(STAGES, str(error)))
+    return State("stale" if stale else "done", provenance.in_words(stale), row, stale)
+
+
+def changed(before: Mapping[str, Any], cell: Cell) -> dict[str, str]:
+    """Stage -> what of its code changed since fingerprints were taken; empty for nothing.
+
+    Raises:
+        ValueError: a plug-in that is not there, or is no Python.
+    """
     words = {
         "method": " or ".join(f"methods/{name}.py" for name in plugins.part_names(cell.method)),
         "backbone": f"backbones/{cell.backbone}.py",
         "harness": "harness",
     }
-    different = [words[key] for key in words if before.get(key) != now[key]]
-    return f"{', '.join(different)} changed" if different else ""
+    return provenance.changes(before, provenance.code(cell), words)
 
 
 def rows(
@@ -185,32 +203,64 @@ def headline(metric: Mapping[str, Any]) -> str:
 
 
 def begin(cell: Cell, runs: Path) -> tuple[Path, str]:
-    """Make a claimed run directory ready; what other code had begun is cleared, not continued.
+    """Make a claimed run directory ready; what other code for training had begun is set aside.
 
     Returns:
-        The directory, and why an earlier start is dropped (empty where none is).
+        The directory, and a line about an earlier start that is not continued (empty for none).
+
+    Raises:
+        ValueError: a plug-in that is not there, or is no Python.
     """
     directory = run_dir(cell, runs)
-    before = read_json(directory / "code.json")
-    why = changed(before, cell) if before is not None else ""
-    if why:
-        clear(directory)
+    before, line = read_json(directory / "code.json"), ""
+    if before is not None and "train" in (stale := changed(before, cell)):
+        line = set_aside(directory, stale["train"])
     (directory / "failed.json").unlink(missing_ok=True)
     write_json(directory / "cell.json", to_dict(cell))
     write_json(directory / "code.json", provenance.code(cell))
-    return directory, why
+    return directory, line
+
+
+def can_renew(cell: Cell, runs: Path) -> bool:
+    """Whether a stale row can be brought up to date, or at least tried, without training."""
+    state = stored(cell, runs)
+    older = provenance.STAMPED_BEFORE in state.stale.values()
+    there = cell.single_task or (run_dir(cell, runs) / "last.pt").is_file()
+    return state.word == "stale" and there and (state.trained or older)
+
+
+def set_aside(directory: Path, why: str) -> str:
+    """Move an earlier training into a folder of its own, so that another begins at step 0.
+
+    Returns:
+        A line that says so and why; empty where nothing was trained.
+    """
+    if not any((directory / name).exists() for name in TRAINED):
+        clear(directory)
+        return ""
+    numbers = [int(path.name.removeprefix(ASIDE)) for path in directory.glob(f"{ASIDE}*")]
+    aside = directory / f"{ASIDE}{max(numbers, default=0) + 1}"
+    aside.mkdir()
+    for path in _of_a_start(directory):
+        path.rename(aside / path.name)
+    if (directory / "cell.json").is_file():
+        shutil.copy(directory / "cell.json", aside)
+    return f"starting over ({why}); what there was is kept in {aside}"
 
 
 def clear(directory: Path) -> None:
     """Forget checkpoint, row and failure: the next start begins at step 0."""
-    if not directory.is_dir():
-        return
-    for path in directory.iterdir():
-        if path.name not in KEPT:
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
+    for path in _of_a_start(directory):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+
+
+def _of_a_start(directory: Path) -> list[Path]:
+    """What a run directory has of its last start."""
+    paths = list(directory.iterdir()) if directory.is_dir() else []
+    return [p for p in paths if p.name not in KEPT and not p.name.startswith(ASIDE)]
 
 
 def write_failure(directory: Path, error: str, trace: str = "", code: int | None = None) -> None:

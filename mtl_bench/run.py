@@ -1,5 +1,6 @@
 """One cell, whole: train, evaluate, time, and the row that says so."""
 
+import json
 import os
 import resource
 import sys
@@ -19,10 +20,10 @@ from mtl_bench.data.kitti import Kitti
 from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.engine import Engine, choose_device
-from mtl_bench.evaluate import evaluate, open_passes
+from mtl_bench.evaluate import Evaluation, evaluate, open_passes
 from mtl_bench.model import Model
 from mtl_bench.progress import Interrupted, Progress
-from mtl_bench.stored import load_model, time_cell
+from mtl_bench.stored import load_model, time_again, time_cell
 from mtl_bench.tracking import Tracker
 from mtl_bench.train import CHECKPOINT, train
 
@@ -64,7 +65,7 @@ def run_cell(
     progress = Progress(run_dir, echo)
     progress.catch_signals()
     tracker = Tracker(wandb, cell, run_dir)
-    environment = provenance.environment(engine.device)
+    code, environment = provenance.code(cell), provenance.environment(engine.device)
     results.write_json(run_dir / "env.json", environment)
 
     open_passes(cell, root)  # what would stop the evaluation is told before the training
@@ -75,12 +76,7 @@ def run_cell(
     model, took = trained.model, trained.time
     echo(f"trained in {took['train_s']:.0f} s ({took['step_ms']:.0f} ms a step)")
 
-    start = time.perf_counter()
-    evaluation = evaluate(
-        model, cell, root, engine.device, progress=lambda n, of: progress.update("evaluate", n, of)
-    )
-    eval_s = time.perf_counter() - start
-    echo(f"evaluated in {eval_s:.0f} s: {results.headline(evaluation.metrics)}")
+    evaluation, eval_s = _evaluate(model, cell, root, engine, progress)
     _save_samples(run_dir / "samples.npz", evaluation.samples)
 
     progress.update("latency", 0, 1)
@@ -92,13 +88,72 @@ def run_cell(
         "metric": {**evaluation.metrics, **timing},
         "protocol": {**evaluation.protocol, **_training_protocol(cell, root), **trained.protocol},
         "time": {**took, "eval_s": eval_s, "latency_s": latency_s},
-        "code": provenance.code(cell),
+        "code": code,
         "env": environment,
     }
     tracker.log({key: value for key, value in row["metric"].items() if not isinstance(value, str)})
     tracker.finish()
     results.write_json(run_dir / "row.json", row)
     return row
+
+
+def renew(
+    cell: Cell, run_dir: Path, root: Path, device: str = "auto", echo: Callable[[str], None] = print
+) -> None:
+    """Evaluate and time a trained cell again, as far as its row is of other code; never train.
+
+    A row that an older version stamped is stamped anew where its checkpoint gives back every metric
+    (latency apart), bit for bit. Where it does not, the row is stale for training from then on.
+    """
+    row = results.load_row(run_dir)
+    assert row is not None
+    code, stale = provenance.code(cell), results.changed(row["code"], cell)
+    older = provenance.STAMPED_BEFORE in stale.values()
+    if "evaluate" in stale:
+        if cell.single_task:
+            for parent in cell.parents:
+                _result_of(parent, run_dir.parent)
+        engine = Engine(choose_device(device), cell.recipe.optim.precision)
+        model, progress = load_model(cell, run_dir / CHECKPOINT, engine), Progress(run_dir, echo)
+        evaluation, eval_s = _evaluate(model, cell, root, engine, progress)
+        timing = {k: v for k, v in row["metric"].items() if k.startswith("latency.")}
+        before = {k: v for k, v in row["metric"].items() if k not in timing}
+        after = {key: evaluation.metrics.get(key) for key in before}
+        if older and json.dumps(before) != json.dumps(after):  # as text: NaN equals itself
+            different = sum(json.dumps(before[k]) != json.dumps(after[k]) for k in before)
+            row["code"] = {stage: {} for stage in code}
+            results.write_json(run_dir / "row.json", row)
+            echo(
+                f"{different} of {len(before)} metrics differ from those of the row, which stays "
+                f"as it is: stale, to be trained again"
+            )
+            return
+        row["metric"] = {**evaluation.metrics, **timing}
+        row["protocol"] |= evaluation.protocol
+        if older:
+            echo("every metric is that of the row, which is stamped anew")
+        else:
+            row["time"]["eval_s"] = eval_s
+            row["env_of_evaluation"] = provenance.environment(engine.device)
+            _save_samples(run_dir / "samples.npz", evaluation.samples)
+    again = "time" in stale and not older
+    row["code"] = {**code, "time": row["code"]["time"]} if again else code
+    results.write_json(run_dir / "row.json", row)
+    if again:
+        time_again(cell, run_dir, root, device, echo)
+
+
+def _evaluate(
+    model: Model, cell: Cell, root: Path, engine: Engine, progress: Progress
+) -> tuple[Evaluation, float]:
+    """With the seconds that it took."""
+    start = time.perf_counter()
+    evaluation = evaluate(
+        model, cell, root, engine.device, progress=lambda n, of: progress.update("evaluate", n, of)
+    )
+    eval_s = time.perf_counter() - start
+    progress.say(f"evaluated in {eval_s:.0f} s: {results.headline(evaluation.metrics)}")
+    return evaluation, eval_s
 
 
 # --- training -------------------------------------------------------------------------------------
@@ -175,8 +230,8 @@ def _result_of(parent: Cell, runs: Path) -> tuple[dict[str, Any], Path]:
     """
     state = results.stored(parent, runs)
     path = results.run_dir(parent, runs) / CHECKPOINT
-    word = state.word if path.is_file() or state.word != "done" else "without its checkpoint"
-    if word != "done" or state.row is None:
+    if not state.trained or state.row is None or not path.is_file():
+        word = "without its checkpoint" if state.trained else state.word
         why = f" ({state.why})" if state.why else ""
         raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: run that one again")
     return state.row, path

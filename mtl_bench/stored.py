@@ -104,12 +104,14 @@ def time_again(
 ) -> None:
     """Replace the latency of a finished cell's row: for one that was taken on a busy machine."""
     engine = Engine(choose_device(device), cell.recipe.optim.precision)
-    row = results.load_row(run_dir)
+    code, row = provenance.code(cell)["time"], results.load_row(run_dir)
     assert row is not None
     model = load_model(cell, run_dir / CHECKPOINT, engine)
     timing, latency_s = time_cell(model, cell, root, engine, Quiet(run_dir.parent))
     row["metric"] |= timing
     row["time"]["latency_s"] = latency_s
+    if "time" in row["code"]:  # not so in a row that an older version stamped
+        row["code"]["time"] = code
     row["env_of_latency"] = provenance.environment(engine.device)
     results.write_json(run_dir / "row.json", row)
     echo(f"timed again in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")

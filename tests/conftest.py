@@ -46,6 +46,24 @@ def smoke_cell() -> Cell:
 
 
 @pytest.fixture
+def change_harness(monkeypatch):
+    """Make the harness look edited, for some stages or all."""
+    from mtl_bench import latency_runs, provenance
+
+    real = provenance.fingerprints
+
+    def change(*stages: str) -> None:
+        def other(stage, roots):
+            edited = {"harness": "edited"} if stage in stages or not stages else {}
+            return real(stage, roots) | edited
+
+        for module in (provenance, latency_runs):
+            monkeypatch.setattr(module, "fingerprints", other)
+
+    return change
+
+
+@pytest.fixture
 def with_optim():
     """Change optimiser settings of a cell."""
 

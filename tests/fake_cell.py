@@ -1,6 +1,6 @@
 """Stands in for `mtl_bench train` in tests of the launcher: claims, reports, writes a row.
 
-    python fake_cell.py ACTION SECONDS CODE_JSON CELL.JSON
+    python fake_cell.py ACTION SECONDS CODE_JSON CELL.JSON [--stale]
 
 Every start and end leaves a line in `history.txt` beside the run directories.
 """
@@ -27,15 +27,17 @@ def interrupt(number, frame):
 
 
 def main() -> None:
-    action, seconds, code, file = sys.argv[1:]
+    action, seconds, code, file, *options = sys.argv[1:]
     signal.signal(signal.SIGTERM, interrupt)
     directory = Path(file).parent
     if action == "silent":
         sys.exit(0)
     try:
         with claim.claim(directory):
-            if (directory / "row.json").exists():
+            if (directory / "row.json").exists() and "--stale" not in options:
                 return
+            if "--stale" in options:
+                results.set_aside(directory, "stale")
             note(directory, "start")
             results.write_json(directory / "code.json", json.loads(code))
             state = {"stage": "train", "step": 1, "steps": 2, "seconds": 1.0, "note": "loss 1"}

@@ -11,7 +11,7 @@ import pytest
 from test_launch import fake, history, hold
 from typer.testing import CliRunner
 
-from mtl_bench import launch, plugins, provenance, results
+from mtl_bench import fingerprint, launch, plugins, provenance, results
 from mtl_bench.cli import app
 from mtl_bench.commands import grid as grid_commands
 from mtl_bench.commands import options
@@ -108,7 +108,8 @@ def test_check_of_something_else(tmp_path):
 
 def test_env_tells_the_fingerprint_and_the_versions():
     text = call("env", "--device", "cpu")
-    assert provenance.harness_fingerprint() in text
+    for stage, roots in provenance.harness_roots().items():
+        assert f"{stage} {fingerprint.fingerprints(stage, roots)['harness']}" in text
     for word in ("torch", "timm", "python", "threads", "git_commit"):
         assert word in text
 
@@ -358,7 +359,12 @@ def train(tmp_path, monkeypatch):
         return call("train", *words, code=code)
 
     run.behave, run.seen = (lambda directory: None), seen
-    module.run_cell = run_cell
+
+    def renew(cell, directory, root, device, echo):
+        run.renewed.append(cell)
+
+    run.renewed = []
+    module.run_cell, module.renew = run_cell, renew
     monkeypatch.setitem(sys.modules, "mtl_bench.run", module)
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
     return run
@@ -410,12 +416,33 @@ def test_train_stops_at_a_parent_that_fails_and_leaves_the_child_alone(train):
     assert results.status(cell, Path("runs")) == "done"
 
 
-def test_train_does_not_build_on_a_stale_parent(train, monkeypatch):
+def test_train_does_not_build_on_a_stale_parent(train, change_harness):
     train(*CELL[:-2])
-    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "changed")
+    change_harness()
     text = one_line("train", *CELL[:-2], "--video")
-    assert "is stale, harness changed: mtl-bench train runs/fixed-tiny-s0-" in text
+    assert (
+        "is stale, train, evaluate, time: harness changed: mtl-bench train runs/fixed-tiny-s0-"
+        in text
+    )
     assert len(train.seen) == 1
+
+
+def test_train_stale_trains_only_where_training_is_concerned(train, change_harness):
+    train(*CELL)
+    cell = train.seen[0][0]
+    directory = Path("runs") / cell.slug
+    assert "done already" in train(*CELL, "--stale")
+    (directory / "last.pt").write_text("state")
+    change_harness("evaluate")
+    assert "done already, but stale: evaluate: harness changed (--stale" in train(*CELL)
+    train(*CELL, "--stale")
+    assert (train.renewed, len(train.seen)) == ([cell], 1)
+    change_harness("train")
+    assert "starting over (train: harness changed" in train(*CELL, "--stale")
+    assert (train.renewed, len(train.seen)) == ([cell], 2)
+    aside = directory / "set-aside-1"
+    assert (aside / "last.pt").read_text() == "state"
+    assert (aside / "row.json").is_file()
 
 
 def test_train_writes_down_why_it_failed(train):
@@ -442,7 +469,7 @@ def test_train_leaves_a_claimed_cell_alone(train):
     assert train.seen == []
 
 
-def test_train_tells_when_a_checkpoint_is_of_other_code(train, monkeypatch):
+def test_train_tells_when_a_checkpoint_is_of_other_code(train, change_harness):
     def stop(directory):
         (directory / "last.pt").write_text("state")
         raise KeyboardInterrupt
@@ -451,10 +478,11 @@ def test_train_tells_when_a_checkpoint_is_of_other_code(train, monkeypatch):
     assert "interrupted" in train(*CELL, code=130)
     cell = Cell(load_recipe("smoke"), "tiny", "fixed", ("depth",))
     assert results.status(cell, Path("runs")) == "interrupted"
-    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "changed")
+    change_harness()
     train.behave = lambda directory: None
-    assert "starting over" in train(*CELL)
+    assert "starting over (harness changed); what there was is kept" in train(*CELL)
     assert not (Path("runs") / cell.slug / "last.pt").exists()
+    assert (Path("runs") / cell.slug / "set-aside-1" / "last.pt").read_text() == "state"
 
 
 # --- as a program ---------------------------------------------------------------------------------

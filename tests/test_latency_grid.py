@@ -18,10 +18,10 @@ from mtl_bench import (
     claim,
     config,
     engines,
+    fingerprint,
     grid_file,
     latency_grid,
     latency_runs,
-    provenance,
     results,
     timing,
 )
@@ -321,7 +321,9 @@ def test_one_after_another_each_leaves_its_row(timings, take):
     row = json.loads((take.runs / "latency" / f"{timings[0].id}.json").read_text())
     assert row["timing"]["engine"] == "plain"
     assert row["smoke"] is True
-    assert set(row["code"]) == {"backbone", "harness"}
+    assert {stage: set(parts) for stage, parts in row["code"].items()} == {
+        "time": {"backbone", "harness"}
+    }
     assert row["seconds"] > 0
     lines = [line for line, _ in take.said]
     assert lines[0] == "[1/3] tiny panoptic,depth 64x128 plain fp32  started"
@@ -360,36 +362,45 @@ def test_one_failing_timing_costs_its_row_only(timings, take, action, why):
 
 
 def test_a_wrong_engine_has_no_time_and_is_tried_again_when_its_code_has_changed(
-    timings, take, monkeypatch
+    timings, take, change_harness
 ):
     take(timings[:2], {"openvino": "wrong"})
     state = latency_runs.inspect(timings[1], take.runs)
     assert (state.word, state.why) == ("wrong", "logits differ by 3")
     assert latency_runs.to_run(timings[:2], take.runs) == []
     assert latency_runs.to_run(timings[:2], take.runs, "failed") == [timings[1]]
-    monkeypatch.setattr(provenance, "harness_fingerprint", lambda **given: "other")
+    change_harness()
     assert words(timings[:2], take.runs) == ["stale", "wrong"]  # it has no time to be stale
     assert latency_runs.to_run(timings[:2], take.runs) == [timings[1]]  # it may be right by now
 
 
-def test_rerun(timings, take, monkeypatch):
+def test_rerun(timings, take, change_harness):
     take(timings[:2])
     assert latency_runs.to_run(timings[:2], take.runs, "stale") == []
     assert latency_runs.to_run(timings[:2], take.runs, "all") == list(timings[:2])
     assert latency_runs.to_run(timings[:2], take.runs, "latency") == list(timings[:2])
-    monkeypatch.setattr(provenance, "harness_fingerprint", lambda **given: "other")
+    change_harness()
     state = latency_runs.inspect(timings[0], take.runs)
-    assert (state.word, state.why) == ("stale", "harness changed")
+    assert (state.word, state.why) == ("stale", "time: harness changed")
     assert state.row is not None
     assert latency_runs.to_run(timings[:2], take.runs) == []
     assert latency_runs.to_run(timings[:2], take.runs, "stale") == list(timings[:2])
 
 
-def test_what_is_fingerprinted_exists_and_is_what_a_pass_runs():
-    for name in latency_runs.MEASURES:
-        assert (provenance.PACKAGE / name).exists(), name
-    before = provenance.harness_fingerprint(names=latency_runs.MEASURES)
-    assert before != provenance.harness_fingerprint()
+def test_a_time_depends_on_its_engine_and_not_on_training(timings):
+    reached = {
+        timing.engine: {
+            path.relative_to(fingerprint.PACKAGE).as_posix()
+            for path, _ in fingerprint.reach("time", latency_runs.roots(timing))
+            if fingerprint.room(path) is not None
+        }
+        for timing in timings
+    }
+    assert "engines/open_vino.py" in reached["openvino"]
+    assert "engines/open_vino.py" not in reached["plain"]
+    for files in reached.values():
+        assert {"engines/timed.py", "latency.py", "finish.py", "model/network.py"} <= files
+        assert not files & {"train.py", "evaluate.py", "data/cityscapes.py", "results.py"}
 
 
 def test_an_interruption_stops_the_process_and_leaves_no_row(timings, take):

@@ -97,17 +97,22 @@ def test_one_job_leaves_the_threads_alone(monkeypatch):
     assert launch.child_environment(3)["OMP_NUM_THREADS"] == "1"
 
 
-def test_stale_rows_are_kept_until_asked_for(tmp_path, monkeypatch):
+def test_stale_rows_are_kept_until_asked_for(tmp_path, change_harness):
     todo = cells(2)
     run(todo, tmp_path)
-    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "changed")
+    change_harness()
     assert launch.to_run(todo, tmp_path) == []
-    assert "stale 2 (harness changed; --rerun stale)" in launch.summary(todo, tmp_path)
+    assert "stale 2 (train, evaluate, time: harness changed; --rerun stale)" in launch.summary(
+        todo, tmp_path
+    )
     again = launch.to_run(todo, tmp_path, "stale")
     assert again == todo
     (tmp_path / todo[0].slug / "last.pt").write_text("of the old code")
     assert run(again, tmp_path, rerun="stale") == ["done"] * 2
     assert not (tmp_path / todo[0].slug / "last.pt").exists()
+    aside = tmp_path / todo[0].slug / "set-aside-1"
+    assert (aside / "last.pt").read_text() == "of the old code"
+    assert {"row.json", "code.json", "cell.json"} <= {path.name for path in aside.iterdir()}
 
 
 def test_rerun_all_and_failed_begin_at_step_0(tmp_path):
@@ -221,13 +226,14 @@ def test_a_failed_parent_leaves_its_child_missing(tmp_path, video, capsys):
     assert run(video, tmp_path) == ["done", "done"]
 
 
-def test_a_stale_parent_is_not_used(tmp_path, video, monkeypatch, capsys):
+def test_a_stale_parent_is_not_used(tmp_path, video, change_harness, capsys):
     parent, child = video
     run([parent], tmp_path)
-    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "changed")
+    change_harness()
     assert launch.to_run([child], tmp_path) == [child]
     assert run([child], tmp_path) == ["missing"]
-    line = f"needs {parent.slug}, which is stale (harness changed; --rerun stale)"
+    why = "train, evaluate, time: harness changed"
+    line = f"needs {parent.slug}, which is stale ({why}; --rerun stale)"
     assert line in capsys.readouterr().out
     assert launch.to_run([child], tmp_path, "stale") == video
     assert run(video, tmp_path, rerun="stale") == ["done", "done"]

@@ -9,15 +9,26 @@ from pathlib import Path
 
 import pytest
 
-from mtl_bench import latency_runs, plugins, provenance
+from mtl_bench import plugins
 
 PACKAGE = plugins.PACKAGE
 MODULES = sorted(PACKAGE.rglob("*.py"))
 LINES = 300
+LONG = {"fingerprint.py": 600}  # one idea, and longer
 
 # A module imports only from rooms before its own (or from its own).
 ORDER = (
-    *("plain", "recipe", "config", "plugins", "cards", "provenance", "data", "geometry"),
+    *(
+        "plain",
+        "recipe",
+        "config",
+        "plugins",
+        "cards",
+        "fingerprint",
+        "provenance",
+        "data",
+        "geometry",
+    ),
     *("depth_scale", "model", "pixels", "grouping", "postprocess", "finish"),
     *("losses", "method", "jacobian", "gradients", "weighting", "by_gradients", "backward"),
     "engine",
@@ -81,33 +92,13 @@ def imported_rooms(tree: ast.AST) -> set[str]:
 def test_module(path):
     text = path.read_text(encoding="utf-8")
     tree = ast.parse(text)
-    assert len(text.splitlines()) <= LINES
+    assert len(text.splitlines()) <= LONG.get(relative(path), LINES)
     assert text.isascii()
     if text:
         assert ast.get_docstring(tree) or path.stem == "__init__", "says not what it is for"
     if path.parent != PACKAGE or path.stem != "__init__":
         known = ORDER[: ORDER.index(room(path)) + 1]
         assert imported_rooms(tree) <= set(known), "imports against the flow"
-
-
-# What modules that make numbers may use without being counted among them: names, files and words.
-AROUND = {"plain", "recipe", "config", "plugins", "provenance", "quiet", "progress", "checkpoint"}
-
-
-@pytest.mark.parametrize(
-    ("names", "others"),
-    [
-        (provenance.HARNESS, {"curve", "tracking"}),
-        # of a timing's network and frames only shapes count: training and data sets do not
-        (latency_runs.MEASURES, {"data", "evaluate", "export", "results", "stored"}),
-    ],
-    ids=["HARNESS", "MEASURES"],
-)
-def test_fingerprints_cover_all_that_numbers_depend_on(names, others):
-    rooms = {name.removesuffix(".py") for name in names}
-    paths = [path for path in MODULES if room(path) in rooms]
-    used = set().union(*(imported_rooms(ast.parse(path.read_text())) for path in paths))
-    assert used - rooms - others - AROUND == set()
 
 
 def literals(tree: ast.AST) -> set[str]:

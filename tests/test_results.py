@@ -10,6 +10,7 @@ from mtl_bench import claim, plugins, provenance, results
 from mtl_bench.config import Cell, Recipe
 
 METHOD = "from mtl_bench.method import LossMethod\n\n\nclass Mine(LossMethod): ...\n"
+CHANGED = METHOD.replace("...", "x = 1")
 
 
 @pytest.fixture
@@ -61,20 +62,35 @@ def test_status_follows_what_is_in_the_directory(cell, tmp_path):
     assert results.status(cell, runs) == "done"
 
 
-def test_row_is_stale_when_its_code_changed(cell, directory, tmp_path, monkeypatch):
+def test_row_is_stale_when_its_code_changed(cell, directory, tmp_path, change_harness):
     write_row(directory, cell)
     runs = tmp_path / "runs"
     method = tmp_path / "methods" / "mine.py"
-    method.write_text(METHOD + "# changed\n")
+    method.write_text(METHOD + "# reworded\n")
+    assert results.status(cell, runs) == "done"
+    method.write_text(CHANGED)
     state = results.inspect(cell, runs)
-    assert (state.word, state.why) == ("stale", "methods/mine.py changed")
+    assert (state.word, state.why) == ("stale", "train: methods/mine.py changed")
     assert state.row is not None
+    assert not state.trained
     method.write_text(METHOD)
     assert results.status(cell, runs) == "done"
-    monkeypatch.setattr(provenance, "harness_fingerprint", lambda: "other")
-    assert results.inspect(cell, runs).why == "harness changed"
+    change_harness("evaluate", "time")
+    state = results.inspect(cell, runs)
+    assert (state.why, state.trained) == ("evaluate, time: harness changed", True)
+    method.write_text("class Mine(")
+    assert "mine.py: SyntaxError" in results.inspect(cell, runs).why
     method.unlink()
     assert "no method called 'mine'" in results.inspect(cell, runs).why
+    assert not results.inspect(cell, runs).trained
+
+
+def test_a_row_of_an_older_version_is_stale_and_says_so(cell, directory, tmp_path):
+    flat = {"method": "a", "backbone": "b", "harness": "c"}
+    results.write_json(directory / "row.json", {"metric": {}, "code": flat})
+    state = results.inspect(cell, tmp_path / "runs")
+    assert (state.word, state.why) == ("stale", "stamped by an older version")
+    assert not state.trained
 
 
 def test_a_composition_is_stale_with_either_of_its_files(cell, directory, tmp_path):
@@ -84,27 +100,17 @@ def test_a_composition_is_stale_with_either_of_its_files(cell, directory, tmp_pa
     place.mkdir()
     write_row(place, both)
     assert results.status(both, tmp_path / "runs") == "done"
-    (tmp_path / "methods" / "other.py").write_text(METHOD + "# changed\n")
+    (tmp_path / "methods" / "other.py").write_text(CHANGED)
     state = results.inspect(both, tmp_path / "runs")
-    assert (state.word, state.why) == ("stale", "methods/mine.py or methods/other.py changed")
+    assert (state.word, state.why) == (
+        "stale",
+        "train: methods/mine.py or methods/other.py changed",
+    )
 
 
-def test_harness_is_every_module_that_makes_numbers(tmp_path):
-    package = provenance.PACKAGE
-    for name in provenance.HARNESS:
-        assert (package / name).exists(), name
-    for name in ("data/labels.py", "method.py"):
-        path = tmp_path / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("x = 1\n")
-    before = provenance.harness_fingerprint(tmp_path)
-    (tmp_path / "cli.py").write_text("not among them")
-    assert provenance.harness_fingerprint(tmp_path) == before
-    (tmp_path / "data" / "labels.py").write_text("x = 2\n")
-    assert provenance.harness_fingerprint(tmp_path) != before
-
-
-def test_begin_continues_its_own_checkpoint_and_drops_that_of_other_code(cell, tmp_path):
+def test_begin_continues_its_own_checkpoint_and_sets_that_of_other_code_aside(
+    cell, tmp_path, change_harness
+):
     runs = tmp_path / "runs"
     results.run_dir(cell, runs).mkdir(parents=True)
     directory, why = results.begin(cell, runs)
@@ -115,10 +121,37 @@ def test_begin_continues_its_own_checkpoint_and_drops_that_of_other_code(cell, t
     assert results.begin(cell, runs) == (directory, "")
     assert (directory / "last.pt").exists()
     assert not (directory / "failed.json").exists()
-    (tmp_path / "methods" / "mine.py").write_text(METHOD + "# changed\n")
-    assert results.begin(cell, runs)[1] == "methods/mine.py changed"
-    assert not (directory / "last.pt").exists()
-    assert (directory / "log.txt").exists()
+    for number, text in enumerate((CHANGED, METHOD), 1):
+        (tmp_path / "methods" / "mine.py").write_text(text)
+        line = results.begin(cell, runs)[1]
+        aside = directory / f"set-aside-{number}"
+        assert line == (
+            f"starting over (methods/mine.py changed); what there was is kept in {aside}"
+        )
+        assert not (directory / "last.pt").exists()
+        assert (aside / "last.pt").read_text() == "state"
+        assert (directory / "log.txt").exists()
+        (directory / "last.pt").write_text("state")
+    results.clear(directory)
+    assert (directory / "set-aside-1").is_dir()
+    results.begin(cell, runs)
+    change_harness("evaluate")
+    (directory / "last.pt").write_text("state")
+    assert results.begin(cell, runs) == (directory, "")  # training goes on
+    assert (directory / "last.pt").exists()
+
+
+def test_begin_sets_aside_what_an_older_version_stamped_and_clears_what_was_not_trained(
+    cell, directory, tmp_path
+):
+    flat = {"method": "a", "backbone": "b", "harness": "c"}
+    results.write_json(directory / "code.json", flat)
+    assert results.begin(cell, tmp_path / "runs")[1] == ""
+    assert not list(directory.glob("set-aside-*"))
+    results.write_json(directory / "code.json", flat)
+    (directory / "last.pt").write_text("state")
+    assert "stamped by an older version" in results.begin(cell, tmp_path / "runs")[1]
+    assert results.read_json(directory / "set-aside-1" / "code.json") == flat
 
 
 def test_cell_file_gives_the_cell_back(cell, tmp_path):

@@ -234,7 +234,7 @@ def test_a_parent_without_a_usable_result_is_one_line(
             (tmp_path / parent.slug / name).write_bytes(content)
         if not gone:
             row = results.load_row(tmp_path / parent.slug)
-            row["code"]["harness"] = "another"
+            row["code"]["train"]["harness"] = "another"
             (tmp_path / parent.slug / "row.json").write_text(json.dumps(row))
     slug = cells[child].parents[0].slug
     with pytest.raises(ValueError, match=rf"this cell needs .*{slug}, which is {word}.*: run") as e:
@@ -256,6 +256,79 @@ def test_side_by_side_gives_each_networks_outputs(cells, finished):
         assert torch.equal(getattr(both, name), getattr(first, name))
     assert torch.equal(both.inverse_depth[0], second.inverse_depth[0])
     assert apart.pose is None
+
+
+# --- only what changed code concerns ---
+
+
+@pytest.fixture
+def together(cells, finished, smoke_root):
+    """`train CELL --stale` of a finished cell; its folder is afterwards as it was."""
+    directory = finished / cells["together"].slug
+    kept = {path: path.read_bytes() for path in directory.iterdir() if path.is_file()}
+
+    def renew():
+        arguments = ["train", str(directory / "cell.json"), "--stale", "--runs", str(finished)]
+        done = CliRunner().invoke(app, [*arguments, "--data", str(smoke_root), "--device", "cpu"])
+        assert done.exit_code == 0, done.output
+        for name in ("last.pt", "curve.csv"):
+            assert (directory / name).read_bytes() == kept[directory / name]
+        assert not list(directory.glob("set-aside-*"))
+        return done.output
+
+    renew.state = lambda: results.inspect(cells["together"], finished)
+    renew.directory = directory
+    yield renew
+    for path, content in kept.items():
+        path.write_bytes(content)
+
+
+def test_a_stale_evaluation_is_made_again_from_the_checkpoint(together, rows, change_harness):
+    row = dict(rows["together"], metric=rows["together"]["metric"] | {"panoptic.pq": -1.0})
+    results.write_json(together.directory / "row.json", row)
+    change_harness("evaluate")
+    assert together.state().why == "evaluate: harness changed"
+    text = together()
+    assert "evaluated in" in text
+    assert "timed" not in text
+    state = together.state()
+    assert (state.word, state.row["metric"]) == ("done", rows["together"]["metric"])
+    assert state.row["code"]["evaluate"]["harness"] == "edited"
+    assert state.row["code"]["train"] == row["code"]["train"]
+    assert "done already" in together()
+
+
+def test_a_stale_latency_is_taken_again(together, rows, change_harness, monkeypatch):
+    monkeypatch.setattr("mtl_bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
+    change_harness("time")
+    text = together()
+    assert "timed again" in text
+    assert "evaluated" not in text
+    state = together.state()
+    assert state.word == "done"
+    assert state.row["metric"] == rows["together"]["metric"] | {"latency.mean_ms": 12.5}
+
+
+FLAT = {"method": "a", "backbone": "b", "harness": "c"}
+
+
+def test_a_row_of_an_older_version_is_stamped_anew_if_its_checkpoint_gives_it_back(together, rows):
+    results.write_json(together.directory / "row.json", rows["together"] | {"code": FLAT})
+    assert together.state().why == "stamped by an older version"
+    assert "every metric is that of the row" in together()
+    assert together.state().word == "done"
+    assert together.state().row == rows["together"]
+
+
+def test_and_otherwise_it_is_stale_for_training(together, rows):
+    row = dict(rows["together"], code=FLAT, metric=dict(rows["together"]["metric"]))
+    row["metric"]["panoptic.pq"] += 1e-12
+    results.write_json(together.directory / "row.json", row)
+    assert "1 of" in together()
+    state = together.state()
+    assert (state.word, state.trained) == ("stale", False)
+    assert "its checkpoint does not give its row's metrics" in state.why
+    assert state.row["metric"] == row["metric"]
 
 
 # --- only the latency again -----------------------------------------------------------------------

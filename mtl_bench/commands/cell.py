@@ -1,7 +1,9 @@
 """`train` and `evaluate`: one cell."""
 
+import contextlib
 import json
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,6 +70,12 @@ def train(
         bool,
         typer.Option("--latency", help="Of a cell that is done, only take the latency again."),
     ] = False,
+    stale: Annotated[
+        bool,
+        typer.Option(
+            "--stale", help="Of a cell that is done, run again only what changed code concerns."
+        ),
+    ] = False,
     data: o.DataOption = None,
     runs: o.RunsOption = Path("runs"),
     device: o.DeviceOption = o.Device.auto,
@@ -103,7 +111,7 @@ def train(
     if latency:
         time_again(cell, data, runs, device.value, quiet)
     else:
-        run(cell, data, runs, device.value, wandb.value, rerun, quiet)
+        run(cell, data, runs, device.value, wandb.value, rerun, quiet, stale)
 
 
 def time_again(cell: Cell, data: Path | None, runs: Path, device: str, quiet: bool) -> None:
@@ -125,7 +133,14 @@ def time_again(cell: Cell, data: Path | None, runs: Path, device: str, quiet: bo
 
 
 def run(
-    cell: Cell, data: Path | None, runs: Path, device: str, wandb: str, rerun: bool, quiet: bool
+    cell: Cell,
+    data: Path | None,
+    runs: Path,
+    device: str,
+    wandb: str,
+    rerun: bool,
+    quiet: bool,
+    stale: bool = False,
 ) -> None:
     """Run what is left of a cell, after the cells that it needs."""
     from mtl_bench import plugins, results
@@ -133,24 +148,31 @@ def run(
     from mtl_bench.grids import with_parents
 
     plugins.check_cells([cell])
-    if not rerun and _done_already(cell, runs):
+    if not rerun and _done_already(cell, runs, stale):
         return
     root = o.data_root(cell, data, quiet)
     echo = o.echo(quiet)
 
     for parent in with_parents(cell.parents):
         state = results.inspect(parent, runs)
-        if state.word == "stale":
-            again = f"mtl-bench train {results.run_dir(parent, runs)}/cell.json --rerun"
+        if state.word == "stale" and not state.trained:
+            again = f"mtl-bench train {results.run_dir(parent, runs)}/cell.json --stale"
             raise ValueError(f"a cell that this one needs is stale, {state.why}: {again}")
-        if state.word != "done":
+        if not state.trained:
             echo(f"{label(cell)} needs {label(parent)} first")
-            _run_claimed(parent, runs, root, device, wandb, False, echo)
-    _run_claimed(cell, runs, root, device, wandb, rerun, echo)
+            _run_claimed(parent, runs, root, device, wandb, echo)
+    _run_claimed(cell, runs, root, device, wandb, echo, rerun, stale)
 
 
 def _run_claimed(
-    cell: Cell, runs: Path, root: Path, device: str, wandb: str, rerun: bool, echo: Any
+    cell: Cell,
+    runs: Path,
+    root: Path,
+    device: str,
+    wandb: str,
+    echo: Any,
+    rerun: bool = False,
+    stale: bool = False,
 ) -> None:
     """Claim a cell and run it; a failure is written down before it is raised."""
     from mtl_bench import claim, launch, results
@@ -160,40 +182,55 @@ def _run_claimed(
         with claim.claim(directory):
             if rerun:
                 results.clear(directory)
-            elif _done_already(cell, runs):  # by another process, in the meantime
+            elif _done_already(cell, runs, stale):  # by another process, in the meantime
                 return
-            _, dropped = results.begin(cell, runs)
-            if dropped:
-                echo(f"starting over, as what the checkpoint was made with is no more: {dropped}")
-            _run_recorded(cell, directory, root, device, wandb, echo)
+            renewed = stale and results.can_renew(cell, runs)
+            if not renewed:
+                _begin(cell, runs, echo)
+            with _recorded(directory):
+                from mtl_bench.run import renew, run_cell
+
+                if renewed:
+                    renew(cell, directory, root, device, echo)
+                else:
+                    run_cell(cell, directory, root, device, wandb, echo)
     except claim.ClaimedError as error:
         typer.echo(f"mtl-bench: {error}", err=True)
         raise typer.Exit(launch.CLAIMED) from None
     echo(f"{directory}/row.json")
 
 
-def _done_already(cell: Cell, runs: Path) -> bool:
+def _begin(cell: Cell, runs: Path, echo: Any) -> None:
     from mtl_bench import results
 
     state = results.stored(cell, runs)
-    if state.row is None:
+    if state.word == "stale":
+        echo(results.set_aside(results.run_dir(cell, runs), state.why))
+    if line := results.begin(cell, runs)[1]:
+        echo(line)
+
+
+def _done_already(cell: Cell, runs: Path, renew: bool) -> bool:
+    from mtl_bench import results
+
+    state = results.stored(cell, runs)
+    if state.row is None or (renew and state.word == "stale"):
         return False
     stale = f", but stale: {state.why}" if state.word == "stale" else ""
+    remedy = f"{'--stale' if stale else '--rerun'} runs it again"
     row = results.run_dir(cell, runs) / "row.json"
-    typer.echo(f"done already{stale} (--rerun runs it again): {row}")
+    typer.echo(f"done already{stale} ({remedy}): {row}")
     return True
 
 
-def _run_recorded(
-    cell: Cell, directory: Path, root: Path, device: str, wandb: str, echo: Any
-) -> None:
-    """Run; whatever ends it early other than an interruption is left in `failed.json`."""
+@contextlib.contextmanager
+def _recorded(directory: Path) -> Iterator[None]:
+    """Whatever ends a run early other than an interruption is left in `failed.json`."""
     from mtl_bench import results
 
+    (directory / "failed.json").unlink(missing_ok=True)
     try:
-        from mtl_bench.run import run_cell
-
-        run_cell(cell, directory, root, device, wandb, echo)
+        yield
     except Exception as error:
         line = " ".join(f"{type(error).__name__}: {error}".split())
         results.write_failure(directory, line, traceback.format_exc())

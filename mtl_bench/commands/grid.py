@@ -53,7 +53,8 @@ def ablate(
         Rerun | None,
         typer.Option(
             "--rerun",
-            help="stale: run cells again whose code has changed. failed: begin failed ones at step "
+            help="stale: of cells whose code has changed, run again what it concerns: training, "
+            "evaluation, latency. failed: begin failed ones at step "
             "0, not at their checkpoint. all: run every cell again. latency: only time them again.",
             show_default=False,
         ),

@@ -150,8 +150,11 @@ def check(
 def env(device: o.DeviceOption = o.Device.auto) -> None:
     """Print versions, hardware and code as they would stand in a row."""
     from mtl_bench.engine import choose_device
-    from mtl_bench.provenance import environment, harness_fingerprint
+    from mtl_bench.fingerprint import fingerprints
+    from mtl_bench.provenance import environment, harness_roots
 
-    values = {**environment(choose_device(device.value)), "harness": harness_fingerprint()}
+    prints = {s: fingerprints(s, roots)["harness"] for s, roots in harness_roots().items()}
+    harness = "  ".join(f"{stage} {print_}" for stage, print_ in prints.items())
+    values = {**environment(choose_device(device.value)), "harness": harness}
     for line in o.columns([[key, str(value)] for key, value in values.items()], indent=""):
         typer.echo(line)

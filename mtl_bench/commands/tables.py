@@ -69,6 +69,6 @@ def _stored(runs: Path) -> list[dict[str, Any]]:
     found = []
     for path in sorted(runs.glob("*/row.json")):
         row = results.load_row(path.parent) or {}
-        why = results.changed(row.get("code", {}), results.load_cell(path.with_name("cell.json")))
-        found.append({**row, "status": "stale" if why else "done", "error": why})
+        state = results.state_of(row, results.load_cell(path.with_name("cell.json")))
+        found.append({**row, "status": state.word, "error": state.why})
     return found

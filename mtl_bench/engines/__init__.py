@@ -30,7 +30,7 @@ PRECISIONS: dict[str, dict[str, tuple[str, ...]]] = {  # engine -> kind of devic
     "tensorrt": {"cuda": ("fp32", "bf16", "fp16")},
 }
 NAMES = tuple(PRECISIONS)
-_CLASSES = {
+CLASSES = {
     "plain": ("plain", "Plain"),
     "eager": ("eager", "Eager"),
     "compile": ("compiled", "Compiled"),
@@ -72,7 +72,7 @@ def check(name: str, precision: str, device: str) -> None:
 
 
 def load(name: str) -> "type[InferenceEngine]":
-    module, kind = _CLASSES[name]
+    module, kind = CLASSES[name]
     found: type[InferenceEngine] = getattr(
         importlib.import_module(f"mtl_bench.engines.{module}"), kind
     )
