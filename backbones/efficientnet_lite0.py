@@ -4,7 +4,7 @@ Tan, Le, EfficientNet: Rethinking Model Scaling for Convolutional Neural Network
 arXiv:1905.11946; the Lite variant is the TensorFlow team's.
 """
 
-from mtl_bench.model import TimmBackbone
+from mtl_bench.core.backbone import TimmBackbone
 
 
 class EfficientNetLite0(TimmBackbone):

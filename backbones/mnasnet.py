@@ -4,7 +4,7 @@ Tan et al., MnasNet: Platform-Aware Neural Architecture Search for Mobile, CVPR 
 arXiv:1807.11626.
 """
 
-from mtl_bench.model import TimmBackbone
+from mtl_bench.core.backbone import TimmBackbone
 
 
 class MNASNet(TimmBackbone):

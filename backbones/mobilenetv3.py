@@ -3,7 +3,7 @@
 Howard et al., Searching for MobileNetV3, ICCV 2019, arXiv:1905.02244.
 """
 
-from mtl_bench.model import TimmBackbone
+from mtl_bench.core.backbone import TimmBackbone
 
 
 class MobileNetV3(TimmBackbone):

@@ -3,7 +3,7 @@
 He, Zhang, Ren, Sun, Deep Residual Learning for Image Recognition, CVPR 2016, arXiv:1512.03385.
 """
 
-from mtl_bench.model import TimmBackbone
+from mtl_bench.core.backbone import TimmBackbone
 
 
 class ResNet18(TimmBackbone):

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
-from mtl_bench.model import Backbone
+from mtl_bench.core.backbone import Backbone
 
 
 class Tiny(Backbone):

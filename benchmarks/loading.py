@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.data import frame_cache, loader, synthetic
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.cityscapes import Cityscapes

@@ -42,8 +42,8 @@ from steps import (
     torchjd_step,
 )
 
-from mtl_bench import cards, plugins
-from mtl_bench.engine import choose_device
+from mtl_bench.core import cards, plugins
+from mtl_bench.core.device import choose_device
 
 # --- measuring ------------------------------------------------------------------------------------
 

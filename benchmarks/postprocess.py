@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtl_bench import postprocess
-from mtl_bench.config import Evaluate
+from mtl_bench.core.config import Evaluate
+from mtl_bench.core.geometry import back_project, depth_from_inverse
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.finish import Finish
-from mtl_bench.geometry import back_project, depth_from_inverse
-from mtl_bench.grouping import nearest
+from mtl_bench.tasks.finish import Finish
+from mtl_bench.tasks.panoptic import postprocess
+from mtl_bench.tasks.panoptic.grouping import nearest
 
 COUNTS = (5, 50, 200)
 THINGS = CITYSCAPES20.things

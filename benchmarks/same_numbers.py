@@ -51,7 +51,16 @@ def record(checkout: Path, work: Path) -> dict[str, str]:
         found |= metrics(method, work / method)
         if method == TRAINED[0]:
             net = work / "net.onnx"
-            run(checkout, "export", "--checkpoint", checkpoint.parent, "--size", "64x128", "--out", net)
+            run(
+                checkout,
+                "export",
+                "--checkpoint",
+                checkpoint.parent,
+                "--size",
+                "64x128",
+                "--out",
+                net,
+            )
             found |= exported(net)
     return found
 

@@ -14,18 +14,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.backward import Pass, backward, losses_now
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.core.device import Engine
+from mtl_bench.core.terms import Term, gather
 from mtl_bench.data import synthetic
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import open_dataset, train_batches
-from mtl_bench.engine import Engine
-from mtl_bench.gradients import stack_losses
-from mtl_bench.losses import loss_terms
-from mtl_bench.losses.terms import Term, gather
 from mtl_bench.model import Model
-from mtl_bench.train import build, build_method
+from mtl_bench.tasks.losses import loss_terms
+from mtl_bench.train.backward import Pass, backward, losses_now
+from mtl_bench.train.gradients import stack_losses
+from mtl_bench.train.loop import build, build_method
 
 try:
     from torchjd import aggregation

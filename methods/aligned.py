@@ -9,7 +9,7 @@ correlations are within the rounding of float32, or a repeated task would shorte
 import torch
 from torch import Tensor
 
-from mtl_bench.method import GradientMethod
+from mtl_bench.core.method import GradientMethod
 
 from ._solvers import ROUNDING, correlation, root
 

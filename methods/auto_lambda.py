@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.losses.terms import Term
-from mtl_bench.method import LookAheadMethod
+from mtl_bench.core.method import LookAheadMethod
+from mtl_bench.core.terms import Term
 
 from ._adam import Adam
 

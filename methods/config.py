@@ -7,7 +7,7 @@ is taken by their correlations, K x K numbers. The direction is that of `imtl_g`
 
 from torch import Tensor
 
-from mtl_bench.method import GradientMethod
+from mtl_bench.core.method import GradientMethod
 
 from ._solvers import correlation, equal_projections
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.losses.terms import Term
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
+from mtl_bench.core.terms import Term
 
 from ._adam import Adam
 

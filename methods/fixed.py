@@ -11,9 +11,9 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from mtl_bench.losses.terms import TASK_KINDS, TERMS, Term
-from mtl_bench.method import LossMethod
-from mtl_bench.plain import did_you_mean
+from mtl_bench.core.method import LossMethod
+from mtl_bench.core.plain import did_you_mean
+from mtl_bench.core.terms import TASK_KINDS, TERMS, Term
 
 PRIORS = ("paper", "equal")
 

@@ -8,7 +8,7 @@ the mean logarithm, because the product itself under- or overflows with many los
 
 from torch import Tensor
 
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
 
 
 class GeometricMean(LossMethod):

@@ -7,8 +7,8 @@ task, gradient balance on the scaled losses for what is shared. It is `imtl_l+im
 
 from collections.abc import Sequence
 
-from mtl_bench.losses.terms import Term
-from mtl_bench.method import Composed
+from mtl_bench.core.method import Composed
+from mtl_bench.core.terms import Term
 
 from .imtl_g import ImpartialGradient
 from .imtl_l import ImpartialLoss

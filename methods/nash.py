@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from mtl_bench.losses.terms import Term
-from mtl_bench.method import GradientMethod
+from mtl_bench.core.method import GradientMethod
+from mtl_bench.core.terms import Term
 
 from ._solvers import fair
 

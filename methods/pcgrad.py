@@ -8,7 +8,7 @@ its own normal plane too, which the algorithm excludes and which fires once othe
 import torch
 from torch import Tensor
 
-from mtl_bench.method import GradientMethod
+from mtl_bench.core.method import GradientMethod
 
 from ._solvers import finite
 

@@ -8,7 +8,7 @@ to 1, those of equal weighting to K: at the same learning rate its steps are K t
 import torch
 from torch import Tensor
 
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
 
 
 class RandomLossWeighting(LossMethod):

@@ -7,7 +7,7 @@ lower bound and turns negative: a schedule must watch a metric instead.
 
 from torch import Tensor
 
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
 
 
 class ScaleInvariant(LossMethod):

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from mtl_bench.losses.terms import Term
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
+from mtl_bench.core.terms import Term
 
 
 class UncertaintyRevised(LossMethod):

@@ -7,15 +7,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mtl_bench import config, latency, results
-from mtl_bench.config import Cell, Recipe, load_recipe
+from mtl_bench import latency
+from mtl_bench.bench import results
+from mtl_bench.bench.stored import load_model
+from mtl_bench.core import config
+from mtl_bench.core.config import Cell, Recipe, load_recipe
+from mtl_bench.core.device import Engine, initial_weights
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import labels_of
 from mtl_bench.data.loader import open_dataset
-from mtl_bench.engine import Engine, initial_weights
 from mtl_bench.engines.scene import Camera, Subject
 from mtl_bench.model import Model, build_model
-from mtl_bench.stored import load_model
 
 IMAGES = 50  # distinct ones
 BUILT_IN = "small"  # recipe of the built-in frames that stand in where no data set is given

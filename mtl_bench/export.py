@@ -24,11 +24,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mtl_bench import __version__, config
+from mtl_bench import __version__
+from mtl_bench.core import config
 from mtl_bench.data.labels import LabelSet
 from mtl_bench.engines import onnx_file
 from mtl_bench.engines.graph import Strided, strided
-from mtl_bench.finish import Finish
+from mtl_bench.tasks.finish import Finish
 
 POST = ("inside", "apart", "none")
 MAPS = {"logits": "semantic", "center": "center", "offset": "offset", "inverse": "inverse_depth"}

@@ -22,13 +22,13 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from mtl_bench import config, geometry
+from mtl_bench.core import config, geometry
+from mtl_bench.core.device import Engine
+from mtl_bench.core.provenance import cpu_model
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.engine import Engine
-from mtl_bench.evaluate import evaluating
-from mtl_bench.finish import Finish
-from mtl_bench.provenance import cpu_model
+from mtl_bench.evaluate.walk import evaluating
+from mtl_bench.tasks.finish import Finish
 
 STAGES = ("transfer", "network", "postprocess")
 MIB = 2**20

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data.cityscapes import Cityscapes
 
 HEIGHT, WIDTH = 16, 32

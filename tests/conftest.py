@@ -10,7 +10,7 @@ import torch
 
 os.environ["HF_HUB_OFFLINE"] = "1"  # nothing may be downloaded in a test
 
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.core.config import Cell, load_recipe
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"  # real samples; not in a public clone
 
@@ -48,7 +48,8 @@ def smoke_cell() -> Cell:
 @pytest.fixture
 def change_harness(monkeypatch):
     """Make the harness look edited, for some stages or all."""
-    from mtl_bench import latency_runs, provenance
+    from mtl_bench.bench import latency_runs
+    from mtl_bench.core import provenance
 
     real = provenance.fingerprints
 

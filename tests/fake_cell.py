@@ -12,8 +12,8 @@ import sys
 import time
 from pathlib import Path
 
-from mtl_bench import claim, results
-from mtl_bench.launch import CLAIMED
+from mtl_bench.bench import claim, results
+from mtl_bench.bench.launch import CLAIMED
 
 
 def note(directory: Path, word: str) -> None:

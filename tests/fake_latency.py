@@ -1,8 +1,8 @@
 """Rows of a grid of latencies as `latency_runs.rows` gives them, made up."""
 
-from mtl_bench.config import TASKS
-from mtl_bench.plain import to_dict
-from mtl_bench.timing import Timing
+from mtl_bench.bench.timing import Timing
+from mtl_bench.core.config import TASKS
+from mtl_bench.core.plain import to_dict
 
 FACTOR = {"plain": 1.0, "eager": 0.8, "onnxruntime": 0.5, "openvino": 0.4}
 BACKBONES = {"resnet18": 1.0, "tiny_one": 0.25}

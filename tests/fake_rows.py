@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
-from mtl_bench import config
+from mtl_bench.core import config
 
 GRID = SimpleNamespace(
     name="backbones",

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data.kitti import Kitti
 from mtl_bench.data.kitti_splits import Frame
 

@@ -5,8 +5,8 @@ import functools
 import torch
 from torch import Tensor, nn
 
-from mtl_bench import config
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.core import config
+from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.engines.scene import Camera, Subject
 from mtl_bench.model import Model, build_model

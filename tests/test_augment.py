@@ -6,9 +6,9 @@ from kornia.enhance import (
     adjust_saturation_with_gray_subtraction,
 )
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data import augment as A
-from mtl_bench.data.targets import OUTSIDE
+from mtl_bench.tasks.panoptic.targets import OUTSIDE
 
 PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)
 MEAN = torch.tensor([123.675, 116.28, 103.53]) / 255

@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import nn
 
-from mtl_bench import plugins
-from mtl_bench.backward import Pass, backward, losses_now
-from mtl_bench.check.methods import TERMS, Quadratics
-from mtl_bench.gradients import frozen_statistics
-from mtl_bench.losses.terms import gather, terms_of
-from mtl_bench.method import Composed, CrossMethod, GradientMethod, LookAheadMethod, LossMethod
+from mtl_bench.bench.check.methods import TERMS, Quadratics
+from mtl_bench.core import plugins
+from mtl_bench.core.method import Composed, CrossMethod, GradientMethod, LookAheadMethod, LossMethod
+from mtl_bench.core.terms import gather, terms_of
+from mtl_bench.train.backward import Pass, backward, losses_now
+from mtl_bench.train.gradients import frozen_statistics
 
 
 class Sum(LossMethod):

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from mtl_bench import cards, plugins
-from mtl_bench.cli import app
+from mtl_bench.cli.app import app
+from mtl_bench.core import cards, plugins
 
 FOLDER = Path(__file__).resolve().parents[1] / "methods"
 SHIPPED = sorted(FOLDER.glob("[!_]*.py"))
@@ -55,8 +55,8 @@ def test_the_median_file_is_short():
 
 @pytest.mark.parametrize("name", [path.stem for path in SHIPPED])
 def test_cards_say_what_the_classes_are(name):
-    from mtl_bench.losses.terms import terms_of
-    from mtl_bench.method import Composed, GradientMethod, LookAheadMethod, LossMethod
+    from mtl_bench.core.method import Composed, GradientMethod, LookAheadMethod, LossMethod
+    from mtl_bench.core.terms import terms_of
 
     (card,) = [card for card in cards.cards() if card.about.name == name]
     kind = plugins.load("methods", name)
@@ -99,7 +99,7 @@ Source: Doe, A Paper of 1066 Words,
 ICML 2031, arXiv:3101.00001, and not NeurIPS 2032.
 """
 
-from mtl_bench import method
+from mtl_bench.core import method
 {imports}
 
 class Mine({base}):

@@ -18,11 +18,11 @@ from cityscapes_tree import (
     write_tree,
 )
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data.check import check
 from mtl_bench.data.cityscapes_files import neighbour, read_instance_ids, unlabelled_names
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE
-from mtl_bench.data.targets import panoptic_targets
+from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 NAME = "aachen_000000_000019"
 PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)

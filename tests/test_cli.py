@@ -11,12 +11,13 @@ import pytest
 from test_launch import fake, history, hold
 from typer.testing import CliRunner
 
-from mtl_bench import fingerprint, launch, plugins, provenance, results
-from mtl_bench.cli import app
-from mtl_bench.commands import grid as grid_commands
-from mtl_bench.commands import options
-from mtl_bench.config import TASKS, Cell, load_recipe
-from mtl_bench.grids import load_grid
+from mtl_bench.bench import launch, results
+from mtl_bench.bench.grid import load_grid
+from mtl_bench.cli import grid as grid_commands
+from mtl_bench.cli import options
+from mtl_bench.cli.app import app
+from mtl_bench.core import fingerprint, plugins, provenance
+from mtl_bench.core.config import TASKS, Cell, load_recipe
 
 GRID = """question = "Does it work?"
 recipe = "smoke"
@@ -172,7 +173,7 @@ def test_a_full_disk_is_one_line_and_a_bug_is_not(monkeypatch):
         def raise_it(*args, **settings):
             raise error
 
-        monkeypatch.setattr("mtl_bench.results.inspect", raise_it)
+        monkeypatch.setattr("mtl_bench.bench.results.inspect", raise_it)
 
     fail(OSError(28, "No space left on device", "runs/x"))
     assert "No space left on device: runs/x" in one_line("status", "--grid", "backbones")
@@ -345,7 +346,7 @@ CELL = ("--recipe", "smoke", "--backbone", "tiny", "--method", "fixed", "--tasks
 @pytest.fixture
 def train(tmp_path, monkeypatch):
     """`train` with a stand-in for the training, which `behave` may replace."""
-    module = types.ModuleType("mtl_bench.run")
+    module = types.ModuleType("mtl_bench.bench.run")
     seen = []
 
     def run_cell(cell, directory, root, device, wandb, echo):
@@ -365,7 +366,7 @@ def train(tmp_path, monkeypatch):
 
     run.renewed = []
     module.run_cell, module.renew = run_cell, renew
-    monkeypatch.setitem(sys.modules, "mtl_bench.run", module)
+    monkeypatch.setitem(sys.modules, "mtl_bench.bench.run", module)
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
     return run
 

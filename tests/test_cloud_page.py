@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.figures import Shown, cloud_page
-from mtl_bench.figures.cloud_page import POINTS, leveled, page_of, thinned
-from mtl_bench.predict import Predicted
-from mtl_bench.predict.cameras import Mounted
-from mtl_bench.predict.point_cloud import PointCloud
+from mtl_bench.show.figures import Shown, cloud_page
+from mtl_bench.show.figures.cloud_page import POINTS, leveled, page_of, thinned
+from mtl_bench.show.predict import Predicted
+from mtl_bench.show.predict.cameras import Mounted
+from mtl_bench.show.predict.point_cloud import PointCloud
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")

@@ -10,8 +10,9 @@ import pytest
 from test_report import Page
 from typer.testing import CliRunner
 
-from mtl_bench import config, results
-from mtl_bench.cli import app
+from mtl_bench.bench import results
+from mtl_bench.cli.app import app
+from mtl_bench.core import config
 from mtl_bench.report import comparison, comparison_files, formats, published
 from mtl_bench.report.groups import SMOKE
 

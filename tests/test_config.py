@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import pytest
 
-from mtl_bench import config
-from mtl_bench.config import Cell, Optim, Recipe, from_dict, override, to_dict
+from mtl_bench.core import config
+from mtl_bench.core.config import Cell, Optim, Recipe, from_dict, override, to_dict
 
 CELL = Cell(Recipe(), "a_backbone", "a_method")
 

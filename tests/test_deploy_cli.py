@@ -9,8 +9,8 @@ import torch
 from typer.testing import CliRunner
 
 from mtl_bench import deploy as build
-from mtl_bench.cli import app
-from mtl_bench.commands import deploy
+from mtl_bench.cli import deploy
+from mtl_bench.cli.app import app
 
 SMALL = ["--backbone", "tiny", "--recipe", "smoke", "--size", "32x64"]
 
@@ -105,7 +105,7 @@ def measured(ms):
 
 
 def test_random_weights_see_no_more_things_than_a_street_has():
-    from mtl_bench.config import TASKS
+    from mtl_bench.core.config import TASKS
     from mtl_bench.data.labels import CITYSCAPES20
 
     _, model = build.untrained("tiny", "smoke", TASKS)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mtl_bench import config
-from mtl_bench.metrics.depth import (
+from mtl_bench.core import config
+from mtl_bench.tasks.depth.errors import (
     NAMES,
     DepthErrors,
     depth_errors,

@@ -16,7 +16,7 @@ MINE = '''"""Log-sum: scale-invariant weighting of my own.
 
 Source: this test.
 """
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
 
 
 class Mine(LossMethod):

@@ -12,7 +12,8 @@ import torch.nn.functional as F
 from small_networks import SIZE, images, model, subject
 from torch import Tensor, nn
 
-from mtl_bench import config, engines
+from mtl_bench import engines
+from mtl_bench.core import config
 from mtl_bench.engines import agreement, roofline, timed
 from mtl_bench.engines.base import Maps, Setting
 from mtl_bench.engines.eager import Eager

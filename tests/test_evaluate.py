@@ -13,16 +13,16 @@ from cityscapesscripts.evaluation import evalPanopticSemanticLabeling as csEval
 from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 
-from mtl_bench import postprocess
-from mtl_bench.baselines import Average, baselines
-from mtl_bench.config import Cell, Data, Evaluate, Loss, Recipe
+from mtl_bench.core.config import Cell, Data, Evaluate, Loss, Recipe
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, IGNORE
 from mtl_bench.data.loader import eval_batches, open_dataset
-from mtl_bench.data.targets import panoptic_targets
-from mtl_bench.evaluate import evaluate
-from mtl_bench.export_predictions import export_predictions, write_panoptic
-from mtl_bench.metrics.panoptic import PanopticQuality
+from mtl_bench.evaluate.export_predictions import export_predictions, write_panoptic
+from mtl_bench.evaluate.trivial import Average, baselines
+from mtl_bench.evaluate.walk import evaluate
 from mtl_bench.model import Outputs
+from mtl_bench.tasks.panoptic import postprocess
+from mtl_bench.tasks.panoptic.quality import PanopticQuality
+from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 HEIGHT, WIDTH, FRAMES = 64, 128, 5
 FOCAL, BASELINE, CAMERA_M = 115.0, 0.5, 1.4

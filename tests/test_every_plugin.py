@@ -2,8 +2,8 @@
 
 import pytest
 
-from mtl_bench import plugins
-from mtl_bench.check import check
+from mtl_bench.bench.check import check
+from mtl_bench.core import plugins
 
 PLUGINS = [(kind, name) for kind in plugins.KINDS for name in plugins.files(kind)]
 
@@ -21,7 +21,7 @@ BROKEN = '''"""A method that is wrong.
 Source: nobody.
 """
 import torch
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
 
 
 class Broken(LossMethod):
@@ -39,7 +39,7 @@ BROKEN_GRADIENT = '''"""A gradient method that is wrong.
 Source: nobody.
 """
 import torch
-from mtl_bench.method import GradientMethod
+from mtl_bench.core.method import GradientMethod
 
 
 class Broken(GradientMethod):

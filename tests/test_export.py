@@ -8,8 +8,9 @@ import pytest
 import torch
 from small_networks import SIZE, images, model
 
-from mtl_bench import config, export
-from mtl_bench.config import load_recipe
+from mtl_bench import export
+from mtl_bench.core import config
+from mtl_bench.core.config import load_recipe
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.engines.agreement import equal_share
 

@@ -11,14 +11,15 @@ from kitti_tree import write_tree
 from test_cloud_page import shown
 from typer.testing import CliRunner
 
-from mtl_bench import checkpoint, figures
-from mtl_bench.cli import app
-from mtl_bench.config import to_dict
+from mtl_bench.bench.results import write_json
+from mtl_bench.cli.app import app
+from mtl_bench.core.config import to_dict
+from mtl_bench.core.device import Engine
 from mtl_bench.data.labels import labels_of
-from mtl_bench.engine import Engine
-from mtl_bench.figures import printed
-from mtl_bench.results import write_json
-from mtl_bench.train import build
+from mtl_bench.show import figures
+from mtl_bench.show.figures import printed
+from mtl_bench.train import checkpoint
+from mtl_bench.train.loop import build
 
 ROAD, SKY = (128, 64, 128), (70, 130, 180)
 
@@ -149,7 +150,7 @@ def test_runs_are_told_apart_by_what_differs(smoke_cell):
 @pytest.fixture(scope="module")
 def run_dir(tmp_path_factory):
     """A run of the smoke recipe that has learned nothing."""
-    from mtl_bench.config import Cell, load_recipe
+    from mtl_bench.core.config import Cell, load_recipe
 
     cell = Cell(load_recipe("smoke"), backbone="tiny", method="fixed_uncertainty")
     folder = tmp_path_factory.mktemp("runs") / cell.slug

@@ -10,9 +10,9 @@ from textwrap import dedent
 
 import pytest
 
-from mtl_bench import fingerprint, plugins, provenance
-from mtl_bench.config import Cell, Recipe
-from mtl_bench.fingerprint import Root
+from mtl_bench.core import fingerprint, plugins, provenance
+from mtl_bench.core.config import Cell, Recipe
+from mtl_bench.core.fingerprint import Root
 
 PACKAGE = fingerprint.PACKAGE
 
@@ -22,7 +22,8 @@ def tree(tmp_path, monkeypatch):
     """A package of a few lines in place of the real one, and its fingerprint of `train`."""
     package = tmp_path / "mtl_bench"
     monkeypatch.setattr(fingerprint, "PACKAGE", package)
-    fingerprint.room.cache_clear()
+    monkeypatch.setattr(fingerprint, "EXCLUDED", {"config"})
+    fingerprint.excluded.cache_clear()
     fingerprint._module_file.cache_clear()
     files = {
         "__init__.py": "",
@@ -91,7 +92,7 @@ def tree(tmp_path, monkeypatch):
         write(name, text)
     taken.write, taken.replace, taken.package = write, replace, package
     yield taken
-    fingerprint.room.cache_clear()
+    fingerprint.excluded.cache_clear()
     fingerprint._module_file.cache_clear()
     fingerprint._modules.clear()
     fingerprint._known.clear()
@@ -340,20 +341,20 @@ def names(reached, file):
 
 
 def test_each_stage_has_what_it_runs(reached):
-    assert {"Engine", "initial_weights", "seed_for"} <= names(reached["train"], "engine")
-    assert "photometric_loss" in names(reached["train"], "losses.photometric")
-    assert "ensure" in names(reached["train"], "pseudo_labels")
-    assert "PanopticQuality" in names(reached["evaluate"], "metrics.panoptic")
-    assert not names(reached["evaluate"], "losses.photometric")
+    assert {"Engine", "initial_weights", "seed_for"} <= names(reached["train"], "core.device")
+    assert "photometric_loss" in names(reached["train"], "tasks.depth.photometric")
+    assert "ensure" in names(reached["train"], "evaluate.pseudo_labels")
+    assert "PanopticQuality" in names(reached["evaluate"], "tasks.panoptic.quality")
+    assert not names(reached["evaluate"], "tasks.depth.photometric")
     assert "measure" in names(reached["time"], "latency")
-    assert not names(reached["time"], "metrics.panoptic")
+    assert not names(reached["time"], "tasks.panoptic.quality")
     for found in reached.values():
         assert "Network" in names(found, "model.network")
 
 
 PROBE = """
 import sys
-from mtl_bench import run, stored
+from mtl_bench.bench import run, stored
 print("\\n".join(m.__file__ for n, m in sys.modules.items() if n.startswith("mtl_bench")))
 """
 # They start a cell, and what they do to its numbers is in the functions that the stages begin with.
@@ -369,7 +370,8 @@ def test_all_that_a_cell_imports_is_covered_or_makes_no_numbers(reached):
         path.relative_to(PACKAGE).as_posix()
         for path in map(Path, done.stdout.split())
         if path not in covered
-        and fingerprint.room(path) not in fingerprint.EXCLUDED | STARTS
+        and not fingerprint.excluded(path)
+        and path.stem not in STARTS
         and any(isinstance(n, ast.FunctionDef) for n in ast.walk(ast.parse(path.read_text())))
     }
     assert left == set()
@@ -385,7 +387,7 @@ def copied(tmp_path, monkeypatch):
     monkeypatch.setattr(fingerprint, "PACKAGE", package)
     monkeypatch.setattr(plugins, "PACKAGE", package)
     monkeypatch.chdir(tmp_path)
-    fingerprint.room.cache_clear()
+    fingerprint.excluded.cache_clear()
     fingerprint._module_file.cache_clear()
     cell = Cell(Recipe(), "tiny", "pcgrad")
     before = provenance.code(cell)
@@ -400,7 +402,7 @@ def copied(tmp_path, monkeypatch):
         return changed
 
     yield seen
-    fingerprint.room.cache_clear()
+    fingerprint.excluded.cache_clear()
     fingerprint._module_file.cache_clear()
 
 
@@ -409,21 +411,22 @@ PARTS = ("method", "backbone", "harness")
 
 def test_edits_are_seen_by_the_stages_that_they_concern(copied):
     harness, method = "harness changed", "method changed"
-    assert copied("mtl_bench/train.py", "to be read from top to bottom", "reworded") == {}
+    assert copied("mtl_bench/train/loop.py", "to be read from top to bottom", "reworded") == {}
     assert copied("methods/pcgrad.py", '"""', '"""Reworded. ') == {}
-    loss = ("mtl_bench/losses/smoothness.py", "def smoothness_loss(", "X = 1\ndef smoothness_loss(")
+    file = "mtl_bench/tasks/depth/smoothness.py"
+    loss = (file, "def smoothness_loss(", "X = 1\ndef smoothness_loss(")
     assert copied(*loss) == {}  # nobody uses it
     assert copied("methods/pcgrad.py", "class PCGrad", "class PCGrad2") == {"train": method}
     assert copied("methods/_solvers.py", "def finite(", "def finite(more=1, *") == {"train": method}
-    where = "mtl_bench/losses/semantic.py"
+    where = "mtl_bench/tasks/panoptic/semantic_loss.py"
     assert copied(where, "def semantic_loss(", "@staticmethod\ndef semantic_loss(") == {
         "train": harness
     }
-    where = "mtl_bench/metrics/semantic.py"
+    where = "mtl_bench/tasks/panoptic/iou.py"
     assert copied(where, "class SemanticIoU", "@staticmethod\nclass SemanticIoU") == {
         "evaluate": harness
     }
     assert set(copied("backbones/tiny.py", "class Tiny", "@staticmethod\nclass Tiny").values()) == {
         "backbone changed"
     }
-    assert copied("mtl_bench/engine.py", "self.scaler.update()", "pass") == {"train": harness}
+    assert copied("mtl_bench/core/device.py", "self.scaler.update()", "pass") == {"train": harness}

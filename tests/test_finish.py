@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from mtl_bench import config, geometry, postprocess
+from mtl_bench.core import config, geometry
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.finish import Finish
+from mtl_bench.tasks.finish import Finish
+from mtl_bench.tasks.panoptic import postprocess
 
 THINGS = CITYSCAPES20.things
 ROAD, SKY, EGO = (CITYSCAPES20.index(name) for name in ("road", "sky", "ego vehicle"))

@@ -12,8 +12,8 @@ import torch
 from cityscapes_tree import HEIGHT, WIDTH, file, instance_ids, open_tree, put_png, write_tree
 from typer.testing import CliRunner
 
-from mtl_bench import config
-from mtl_bench.cli import app
+from mtl_bench.cli.app import app
+from mtl_bench.core import config
 from mtl_bench.data import frame_cache
 from mtl_bench.data.loader import eval_batches, train_batches
 

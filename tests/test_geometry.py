@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mtl_bench import geometry
+from mtl_bench.core import geometry
 
 F64 = torch.float64
 

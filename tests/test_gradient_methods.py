@@ -18,9 +18,9 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from mtl_bench import plugins
-from mtl_bench.losses.terms import Term
-from mtl_bench.method import LookAheadMethod
+from mtl_bench.core import plugins
+from mtl_bench.core.method import LookAheadMethod
+from mtl_bench.core.terms import Term
 
 torchjd = pytest.importorskip("torchjd.aggregation")
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 from scipy.optimize import minimize
 
-from mtl_bench import plugins
-from mtl_bench.backward import backward
-from mtl_bench.check.methods import TERMS, Quadratics
-from mtl_bench.losses.terms import Term
+from mtl_bench.bench.check.methods import TERMS, Quadratics
+from mtl_bench.core import plugins
+from mtl_bench.core.terms import Term
+from mtl_bench.train.backward import backward
 
 NAMES = (
     *("mgda", "mgda_ub", "pcgrad", "gradvac", "cagrad", "imtl_g", "nash"),

@@ -2,9 +2,11 @@ import dataclasses
 
 import pytest
 
-from mtl_bench import grid_file, grids, plugins
-from mtl_bench.config import Cell, load_recipe
-from mtl_bench.grids import load_grid
+from mtl_bench.bench import grid as grids
+from mtl_bench.bench import grid_file
+from mtl_bench.bench.grid import load_grid
+from mtl_bench.core import plugins
+from mtl_bench.core.config import Cell, load_recipe
 
 GRID = """question = "Does it work?"
 recipe = "smoke"
@@ -307,7 +309,7 @@ def test_the_ablation_has_the_papers_rows():
 
 @pytest.mark.parametrize("recipe", ["smoke", "small", "cityscapes"])
 def test_the_controls_halve_and_double_under_any_recipe(recipe):
-    from mtl_bench.losses.terms import TERMS
+    from mtl_bench.core.terms import TERMS
 
     grid = load_grid("ablation-controls", recipe=recipe)
     cells = {grid.names[cell.id]: cell for cell in grid.cells}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from mtl_bench import grouping
+from mtl_bench.tasks.panoptic import grouping
 
 SIZE = (96, 200)
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from mtl_bench.jacobian import CPU_CHUNK, add, combine, divided, flatten, products, unflatten
+from mtl_bench.train.gramian import CPU_CHUNK, add, combine, divided, flatten, products, unflatten
 
 SHAPES = [(3, 4), (CPU_CHUNK + 5,), (2 * CPU_CHUNK,), (1,)]
 LIKE = [torch.empty(shape) for shape in SHAPES]

@@ -31,17 +31,19 @@ from kitti_tree import (
 )
 from typer.testing import CliRunner
 
-from mtl_bench import claim, config, pseudo_labels, results
-from mtl_bench.baselines import baselines
-from mtl_bench.cli import app
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.bench import claim, results
+from mtl_bench.bench.run import run_cell
+from mtl_bench.cli.app import app
+from mtl_bench.core import config
+from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.data import kitti_files, kitti_splits, velodyne
 from mtl_bench.data.check_kitti import check_kitti
 from mtl_bench.data.kitti_files import Tree, read_camera, scanner_to_pixels
 from mtl_bench.data.kitti_splits import Frame
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, labels_of
 from mtl_bench.data.loader import eval_batches, open_dataset
-from mtl_bench.run import run_cell
+from mtl_bench.evaluate import pseudo_labels
+from mtl_bench.evaluate.trivial import baselines
 
 REAL = SHARED / "data" / "kitti_raw"
 LISTS = SHARED / "data" / "splits"

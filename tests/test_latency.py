@@ -7,10 +7,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from mtl_bench import config, finish, latency
+from mtl_bench import latency
+from mtl_bench.core import config
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.model import Outputs
+from mtl_bench.tasks import finish
 
 CLASSES = len(CITYSCAPES20)
 HEIGHT, WIDTH = 32, 64

@@ -14,19 +14,11 @@ import fake_latency
 import pytest
 from typer.testing import CliRunner
 
-from mtl_bench import (
-    claim,
-    config,
-    engines,
-    fingerprint,
-    grid_file,
-    latency_grid,
-    latency_runs,
-    results,
-    timing,
-)
-from mtl_bench.cli import app
-from mtl_bench.timing import Timing
+from mtl_bench import engines
+from mtl_bench.bench import claim, grid_file, latency_grid, latency_runs, results, timing
+from mtl_bench.bench.timing import Timing
+from mtl_bench.cli.app import app
+from mtl_bench.core import config, fingerprint
 
 FAKE = Path(__file__).with_name("fake_timing.py")
 GRID = """kind = "latency"
@@ -78,7 +70,7 @@ def test_the_shipped_grid_has_what_the_paper_deploys():
 def test_it_stands_in_the_list_and_is_no_grid_of_cells():
     assert "latency" in grid_file.grid_names()
     assert grid_file.question_of("latency") == latency_grid.load("latency").question
-    from mtl_bench.grids import load_grid
+    from mtl_bench.bench.grid import load_grid
 
     with pytest.raises(ValueError, match="no cells to train"):
         load_grid("latency")
@@ -392,7 +384,7 @@ def test_a_time_depends_on_its_engine_and_not_on_training(timings):
         timing.engine: {
             path.relative_to(fingerprint.PACKAGE).as_posix()
             for path, _ in fingerprint.reach("time", latency_runs.roots(timing))
-            if fingerprint.room(path) is not None
+            if fingerprint.ours(path)
         }
         for timing in timings
     }
@@ -433,7 +425,7 @@ def test_a_second_launcher_is_refused(timings, take):
 
 
 def test_cells_in_training_hold_still(timings, take):
-    from mtl_bench.quiet import Quiet
+    from mtl_bench.core.quiet import Quiet
 
     seen = []
 
@@ -562,7 +554,7 @@ def test_a_second_launcher_ends_with_one_line(ablate):
 
 
 def test_quality_beside_the_speed_is_of_every_seed_that_is_done(monkeypatch, tmp_path):
-    from mtl_bench.commands import latency_grid as commands
+    from mtl_bench.cli import latency_grid as commands
 
     def rows(cells, runs):
         return [{"slug": c.slug, "status": "done" if c.seed < 2 else "missing"} for c in cells]

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from mtl_bench import claim, launch, provenance, results
-from mtl_bench.config import Cell, Recipe
-from mtl_bench.display import Lines, Running, duration, label
+from mtl_bench.bench import claim, launch, results
+from mtl_bench.cli.display import Lines, Running, duration, label
+from mtl_bench.core import provenance
+from mtl_bench.core.config import Cell, Recipe
 
 FAKE = Path(__file__).with_name("fake_cell.py")
 
@@ -255,8 +256,8 @@ def test_a_parent_that_another_process_runs_is_waited_for(tmp_path, video, actio
 LAUNCH = """
 import json, signal, sys
 from pathlib import Path
-from mtl_bench import launch
-from mtl_bench.display import Lines
+from mtl_bench.bench import launch
+from mtl_bench.cli.display import Lines
 sys.path.insert(0, {tests!r})
 from test_launch import cells, fake
 
@@ -351,7 +352,7 @@ def test_bars_show_running_and_ended_cells(tmp_path, monkeypatch):
     from rich import progress
     from rich.console import Console
 
-    from mtl_bench.display import Bars
+    from mtl_bench.cli.display import Bars
 
     console = Console(file=(out := (tmp_path / "out.txt").open("w+")), width=120)
     monkeypatch.setattr(progress, "get_console", lambda: console)

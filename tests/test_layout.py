@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mtl_bench import plugins
+from mtl_bench.core import plugins
 
 PACKAGE = plugins.PACKAGE
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -128,7 +128,7 @@ def test_every_grid_and_recipe_ships_with_a_purpose():
 
 PROBE = """
 import sys
-from mtl_bench.cli import app
+from mtl_bench.cli.app import app
 try:
     app(sys.argv[1:])
 except SystemExit as end:

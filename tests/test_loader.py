@@ -11,7 +11,7 @@ import pytest
 import torch
 from cityscapes_tree import HEIGHT, WIDTH, file, open_tree, write_tree
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data import loader
 from mtl_bench.data.cityscapes import Cityscapes
 from mtl_bench.data.loader import eval_batches, open_dataset, train_batches

@@ -13,9 +13,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from mtl_bench import plugins
-from mtl_bench.config import TASKS
-from mtl_bench.losses.terms import Term, terms_of
+from mtl_bench.core import plugins
+from mtl_bench.core.config import TASKS
+from mtl_bench.core.terms import Term, terms_of
 
 NAMES = (
     *("fixed", "uncertainty", "fixed_uncertainty", "uncertainty_revised", "uncertainty_soft"),

@@ -7,15 +7,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mtl_bench import config, geometry
+from mtl_bench.core import config, geometry
 from mtl_bench.data.batch import Batch
-from mtl_bench.losses import TERMS, loss_terms, terms_of
-from mtl_bench.losses.instance import center_loss, offset_loss
-from mtl_bench.losses.photometric import photometric_loss
-from mtl_bench.losses.semantic import semantic_loss
-from mtl_bench.losses.smoothness import smoothness_loss
-from mtl_bench.losses.ssim import PhotometricError
 from mtl_bench.model import Outputs
+from mtl_bench.tasks.depth.photometric import photometric_loss
+from mtl_bench.tasks.depth.smoothness import smoothness_loss
+from mtl_bench.tasks.depth.ssim import PhotometricError
+from mtl_bench.tasks.losses import TERMS, loss_terms, terms_of
+from mtl_bench.tasks.panoptic.instance_loss import center_loss, offset_loss
+from mtl_bench.tasks.panoptic.semantic_loss import semantic_loss
 
 F64 = torch.float64
 TASKS = ("panoptic", "depth")

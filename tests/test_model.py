@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import nn
 
-from mtl_bench.config import Cell, Network, Recipe, load_recipe, recipe_names
+from mtl_bench.core.config import Cell, Network, Recipe, load_recipe, recipe_names
+from mtl_bench.core.device import initial_weights
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
-from mtl_bench.engine import initial_weights
 from mtl_bench.model import build_model
 from mtl_bench.model.layers import Decoder, GlobalContext, Head
-from mtl_bench.model.pose import PoseNetwork
+from mtl_bench.tasks.depth.pose import PoseNetwork
 
 PAPER = Cell(Recipe(), backbone="resnet18", method="fixed")
 SMALL = Network(strides=(2, 4, 8), channels=8, fused=8, head=8, pose="light", pose_channels=8)

@@ -12,10 +12,10 @@ from cityscapesscripts.evaluation import evalPanopticSemanticLabeling as csEval
 from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
-from mtl_bench.export_predictions import write_panoptic
-from mtl_bench.metrics.delta import delta_flat, delta_task
-from mtl_bench.metrics.panoptic import VOID, PanopticQuality, Segments, Tally, match
-from mtl_bench.metrics.semantic import SemanticIoU
+from mtl_bench.evaluate.delta import delta_flat, delta_task
+from mtl_bench.evaluate.export_predictions import write_panoptic
+from mtl_bench.tasks.panoptic.iou import SemanticIoU
+from mtl_bench.tasks.panoptic.quality import VOID, PanopticQuality, Segments, Tally, match
 
 PUBLISHED = Path(__file__).parents[2] / "shared/data/deeplab2_testdata/evaluation"
 

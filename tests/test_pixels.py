@@ -4,7 +4,7 @@ import cv2
 import pytest
 import torch
 
-from mtl_bench import pixels
+from mtl_bench.tasks.panoptic import pixels
 
 SIZES = [(1, 1, 1), (1, 9, 1), (3, 1, 7), (2, 23, 17)]
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import pytest
 
-from mtl_bench import plugins
-from mtl_bench.config import Cell, Recipe
+from mtl_bench.core import plugins
+from mtl_bench.core.config import Cell, Recipe
 
 METHOD = '''"""Doubles everything.
 
 Source: a test.
 """
 
-from mtl_bench.method import LossMethod
+from mtl_bench.core.method import LossMethod
 
 
 class Mine(LossMethod):
@@ -87,7 +87,7 @@ def test_added_folder(tmp_path, place, given):
 
 
 def test_added_file_and_kind_by_import(tmp_path):
-    text = "from mtl_bench.model import Backbone\n\nclass Net(Backbone): ...\n"
+    text = "from mtl_bench.core.backbone import Backbone\n\nclass Net(Backbone): ...\n"
     plugins.add_folder(put(tmp_path / "odd" / "net.py", text))
     assert plugins.kinds_of("net") == ["backbones"]
     put(tmp_path / "odd" / "notes.py", "x = 1\n")
@@ -151,7 +151,7 @@ def test_impossible_name_is_listed_as_broken(tmp_path):
         ("import not_installed_xyz\n", "No module named 'not_installed_xyz'"),
         ("class A: ...\n", "must define one subclass of Method, and defines none"),
         (METHOD + "\n\nclass Two(Mine): ...\n", "one subclass of Method, and defines Mine, Two"),
-        ("from mtl_bench.method import LossMethod\n", "defines none"),
+        ("from mtl_bench.core.method import LossMethod\n", "defines none"),
     ],
 )
 def test_a_broken_file_says_why_when_chosen(tmp_path, text, why):

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mtl_bench import predict
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.data.synthetic.files import write_scene
 from mtl_bench.data.synthetic.settings import Settings
-from mtl_bench.predict import Predicted
-from mtl_bench.predict.point_cloud import from_maps, from_prediction, write_npz, write_ply
+from mtl_bench.show import predict
+from mtl_bench.show.predict import Predicted
+from mtl_bench.show.predict.point_cloud import from_maps, from_prediction, write_npz, write_ply
 
 ROAD, CAR, SKY, EGO = 7, 26, 23, 1
 

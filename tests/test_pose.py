@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from mtl_bench.model.pose import FlowEncoder, PoseNetwork
+from mtl_bench.tasks.depth.pose import FlowEncoder, PoseNetwork
 
 
 def picture(height: int = 64, width: int = 128, grain: int = 8) -> torch.Tensor:

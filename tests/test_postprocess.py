@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from mtl_bench import config, depth_scale, postprocess
+from mtl_bench.core import config
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE
-from mtl_bench.data.targets import panoptic_targets
-from mtl_bench.metrics.panoptic import PanopticQuality
 from mtl_bench.model import Outputs
+from mtl_bench.tasks.depth import scale as depth_scale
+from mtl_bench.tasks.panoptic import postprocess
+from mtl_bench.tasks.panoptic.quality import PanopticQuality
+from mtl_bench.tasks.panoptic.targets import panoptic_targets
 
 THINGS = CITYSCAPES20.things
 ROAD, SKY, PERSON, CAR = (CITYSCAPES20.index(name) for name in ("road", "sky", "person", "car"))

@@ -17,15 +17,16 @@ from conftest import SHARED
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench import predict, results
-from mtl_bench.cli import app
-from mtl_bench.config import Cell, load_recipe, to_dict
+from mtl_bench.bench import results
+from mtl_bench.cli.app import app
+from mtl_bench.core.config import Cell, load_recipe, to_dict
+from mtl_bench.core.geometry import scale_intrinsics
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, IGNORE
-from mtl_bench.geometry import scale_intrinsics
 from mtl_bench.model import Outputs, build_model
-from mtl_bench.predict import HEIGHTS, METRES, UNSCALED, Predictor, video
-from mtl_bench.predict import job as predictions
-from mtl_bench.predict.cameras import Given, camera_of
+from mtl_bench.show import predict
+from mtl_bench.show.predict import HEIGHTS, METRES, UNSCALED, Predictor, video
+from mtl_bench.show.predict import job as predictions
+from mtl_bench.show.predict.cameras import Given, camera_of
 
 ROAD, SKY, EGO = (CITYSCAPES20.index(name) for name in ("road", "sky", "ego vehicle"))
 RUNNER = CliRunner()

@@ -8,18 +8,20 @@ import pytest
 import torch
 from torch import nn
 
-from mtl_bench import config, postprocess, protocols
-from mtl_bench.collector import FLIP, Collector, DepthScore, Prediction
-from mtl_bench.config import Cell, load_recipe
+from mtl_bench.core import config
+from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.data import synthetic
 from mtl_bench.data.batch import Batch
 from mtl_bench.data.labels import CITYSCAPES19
 from mtl_bench.data.layouts import KITTI
 from mtl_bench.data.loader import open_dataset
-from mtl_bench.evaluate import evaluate, open_passes, predict
-from mtl_bench.metrics.depth import NAMES, evaluation_mask
+from mtl_bench.evaluate.collector import FLIP, Collector, DepthScore, Prediction
+from mtl_bench.evaluate.walk import evaluate, open_passes, predict
 from mtl_bench.model import Outputs
-from mtl_bench.protocols import NAMED, Protocol
+from mtl_bench.tasks.depth import protocols
+from mtl_bench.tasks.depth.errors import NAMES, evaluation_mask
+from mtl_bench.tasks.depth.protocols import NAMED, Protocol
+from mtl_bench.tasks.panoptic import postprocess
 
 CPU = torch.device("cpu")
 KITTI_FRAME, CITYSCAPES_FRAME = (375, 1242), (1024, 2048)

@@ -15,18 +15,20 @@ from cityscapesscripts.preparation.createPanopticImgs import convert2panoptic
 from torch import nn
 from typer.testing import CliRunner
 
-from mtl_bench import checkpoint, pseudo_frames, pseudo_labels, results
-from mtl_bench.cli import app
-from mtl_bench.config import Augment, Cell, Data, Evaluate, Loss, Network, PseudoLabels, Recipe
+from mtl_bench.bench import results
+from mtl_bench.cli.app import app
+from mtl_bench.core.config import Augment, Cell, Data, Evaluate, Loss, Network, PseudoLabels, Recipe
+from mtl_bench.core.plain import to_dict
 from mtl_bench.data import synthetic
 from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, file_of, names_in, read_instance_ids
 from mtl_bench.data.labels import CITYSCAPES20, IGNORE
 from mtl_bench.data.loader import open_dataset
 from mtl_bench.data.synthetic import render
-from mtl_bench.data.targets import class_of_instance_id, panoptic_targets
+from mtl_bench.evaluate import pseudo_frames, pseudo_labels
+from mtl_bench.evaluate.pseudo_labels import RECORD, average, ensure, pass_sizes
 from mtl_bench.model import Outputs, build_model
-from mtl_bench.plain import to_dict
-from mtl_bench.pseudo_labels import RECORD, average, ensure, pass_sizes
+from mtl_bench.tasks.panoptic.targets import class_of_instance_id, panoptic_targets
+from mtl_bench.train import checkpoint
 
 HEIGHT, WIDTH = 64, 128
 CPU = torch.device("cpu")

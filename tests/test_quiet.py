@@ -5,12 +5,12 @@ import subprocess
 import sys
 import time
 
-from mtl_bench.quiet import Quiet
+from mtl_bench.core.quiet import Quiet
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from mtl_bench.quiet import Quiet
+from mtl_bench.core.quiet import Quiet
 with Quiet(Path(sys.argv[1])).alone(neighbours=False):
     print("held", flush=True)
     time.sleep(float(sys.argv[2]))

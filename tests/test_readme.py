@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from mtl_bench.check import check
-from mtl_bench.grids import load_grid
+from mtl_bench.bench.check import check
+from mtl_bench.bench.grid import load_grid
 from mtl_bench.report import readme
 
 README = Path(__file__).resolve().parents[1] / "README.md"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mtl_bench import render
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
-from mtl_bench.render import canvas, depth, panoptic
+from mtl_bench.show import render
+from mtl_bench.show.render import canvas, depth, panoptic
 
 ROAD, CAR = (128, 64, 128), (0, 0, 142)
 

@@ -15,7 +15,8 @@ import pytest
 import rich.console
 from fake_rows import BASELINE, GRID, failed_row, grid_rows, make_row, write_runs
 
-from mtl_bench import config, report
+from mtl_bench import report
+from mtl_bench.core import config
 from mtl_bench.report import formats, page, pictures, readme
 from mtl_bench.report.groups import SMOKE
 from mtl_bench.report.notes import footnotes

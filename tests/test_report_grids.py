@@ -12,7 +12,7 @@ from fake_rows import BASELINE, GRID, curve, grid_rows, make_row, write_runs
 from matplotlib.text import Text
 
 from mtl_bench import report
-from mtl_bench.metrics.delta import delta_flat, delta_task
+from mtl_bench.evaluate.delta import delta_flat, delta_task
 from mtl_bench.report import curves, delta, formats, page, plots, style
 from mtl_bench.report.layout import Layout
 from mtl_bench.report.notes import footnotes

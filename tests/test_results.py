@@ -6,10 +6,11 @@ import time
 
 import pytest
 
-from mtl_bench import claim, plugins, provenance, results
-from mtl_bench.config import Cell, Recipe
+from mtl_bench.bench import claim, results
+from mtl_bench.core import plugins, provenance
+from mtl_bench.core.config import Cell, Recipe
 
-METHOD = "from mtl_bench.method import LossMethod\n\n\nclass Mine(LossMethod): ...\n"
+METHOD = "from mtl_bench.core.method import LossMethod\n\n\nclass Mine(LossMethod): ...\n"
 CHANGED = METHOD.replace("...", "x = 1")
 
 

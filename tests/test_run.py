@@ -7,13 +7,15 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from mtl_bench import checkpoint, claim, launch, pseudo_frames, results
-from mtl_bench.cli import app
-from mtl_bench.config import Cell, load_recipe, to_dict
-from mtl_bench.grids import with_parents
-from mtl_bench.progress import Interrupted
-from mtl_bench.run import run_cell
-from mtl_bench.stored import load_model, reevaluate
+from mtl_bench.bench import claim, launch, results
+from mtl_bench.bench.grid import with_parents
+from mtl_bench.bench.run import run_cell
+from mtl_bench.bench.stored import load_model, reevaluate
+from mtl_bench.cli.app import app
+from mtl_bench.core.config import Cell, load_recipe, to_dict
+from mtl_bench.evaluate import pseudo_frames
+from mtl_bench.train import checkpoint
+from mtl_bench.train.progress import Interrupted
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +134,7 @@ def test_it_goes_on_from_its_parents_weights(cells, finished, rows):
 
 
 def test_it_trains_on_both_kinds_of_labels(cells, finished, smoke_root, tmp_path, monkeypatch):
-    from mtl_bench import train
+    from mtl_bench.train import loop as train
 
     copy_parent(cells, finished, tmp_path)
     opened, open_dataset = [], train.open_dataset
@@ -181,7 +183,7 @@ def crash_before_the_row(monkeypatch):
     def never(*given, **settings):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mtl_bench.run.evaluate", never)
+    monkeypatch.setattr("mtl_bench.bench.run.evaluate", never)
 
 
 @pytest.mark.parametrize("crash", [crash_in_labels, crash_in_training, crash_before_the_row])
@@ -202,7 +204,7 @@ def test_stopped_anywhere_it_ends_with_the_same_row(
 
 def test_a_signal_during_the_labels_stops_it(cells, finished, smoke_root, tmp_path, monkeypatch):
     copy_parent(cells, finished, tmp_path)
-    update = "mtl_bench.progress.Progress.update"
+    update = "mtl_bench.train.progress.Progress.update"
     monkeypatch.setattr(update, lambda self, stage, *given: setattr(self, "stop_asked", True))
     with pytest.raises(Interrupted, match="stopped at pseudo label 0 of 16"):
         execute(cells["video"], tmp_path, smoke_root)
@@ -243,7 +245,7 @@ def test_a_parent_without_a_usable_result_is_one_line(
 
 
 def test_side_by_side_gives_each_networks_outputs(cells, finished):
-    from mtl_bench.engine import Engine
+    from mtl_bench.core.device import Engine
 
     engine = Engine(torch.device("cpu"), "fp32")
     apart, panoptic, depth = (
@@ -299,7 +301,7 @@ def test_a_stale_evaluation_is_made_again_from_the_checkpoint(together, rows, ch
 
 
 def test_a_stale_latency_is_taken_again(together, rows, change_harness, monkeypatch):
-    monkeypatch.setattr("mtl_bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
+    monkeypatch.setattr("mtl_bench.bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
     change_harness("time")
     text = together()
     assert "timed again" in text
@@ -337,7 +339,7 @@ def test_and_otherwise_it_is_stale_for_training(together, rows):
 @pytest.mark.parametrize("name", ["together", "apart"])
 def test_latency_alone_can_be_taken_again(name, cells, finished, rows, smoke_root, monkeypatch):
     cell, before = cells[name], rows[name]
-    monkeypatch.setattr("mtl_bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
+    monkeypatch.setattr("mtl_bench.bench.stored.measure", lambda *given: {"latency.mean_ms": 12.5})
     arguments = [str(finished / cell.slug / "cell.json"), "--latency", "--runs", str(finished)]
     done = CliRunner().invoke(app, ["train", *arguments, "--data", str(smoke_root)])
     assert done.exit_code == 0, done.output

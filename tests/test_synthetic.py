@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mtl_bench.config import Data
+from mtl_bench.core.config import Data
 from mtl_bench.data import synthetic
 from mtl_bench.data.labels import CITYSCAPES20, KNOWN_LABEL_IDS
 from mtl_bench.data.synthetic import render

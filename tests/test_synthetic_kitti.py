@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_synthetic import digests, read, warp_error
 
-from mtl_bench.config import Cell, Data, load_recipe
+from mtl_bench.core.config import Cell, Data, load_recipe
 from mtl_bench.data import kitti_files, synthetic, velodyne
 from mtl_bench.data.labels import CITYSCAPES19
 from mtl_bench.data.layouts import KITTI, layout_of

@@ -3,9 +3,9 @@ import time
 import numpy as np
 import pytest
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20, IGNORE
-from mtl_bench.data.targets import OUTSIDE, class_of_instance_id, panoptic_targets
+from mtl_bench.tasks.panoptic.targets import OUTSIDE, class_of_instance_id, panoptic_targets
 
 LOSS = config.Loss()
 
@@ -124,7 +124,7 @@ def test_many_segments_are_drawn_as_few_are(monkeypatch):
     assert len(np.unique(many)) > 256  # more than a byte tells apart
     few = random.choice([7, 26, 24000, 26003, OUTSIDE], (30, 40)).astype(np.int32)
     expected = panoptic_targets(few, CITYSCAPES20, LOSS)
-    monkeypatch.setattr("mtl_bench.data.targets._BYTE", 0)
+    monkeypatch.setattr("mtl_bench.tasks.panoptic.targets._BYTE", 0)
     for name, values in vars(panoptic_targets(few, CITYSCAPES20, LOSS)).items():
         assert np.array_equal(values, getattr(expected, name)), name
     targets = panoptic_targets(many, CITYSCAPES20, LOSS)

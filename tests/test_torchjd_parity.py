@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import torch
 
-from mtl_bench import plugins
-from mtl_bench.losses.terms import Term
+from mtl_bench.core import plugins
+from mtl_bench.core.terms import Term
 
 theirs = pytest.importorskip("torchjd.aggregation")
 cvxpy = pytest.importorskip("cvxpy")

@@ -5,12 +5,12 @@ import sys
 
 import pytest
 
-from mtl_bench.tracking import Tracker
+from mtl_bench.train.tracking import Tracker
 
 
 def test_off_does_not_import_wandb():
     code = (
-        "import sys; from mtl_bench.tracking import Tracker; "
+        "import sys; from mtl_bench.train.tracking import Tracker; "
         "t = Tracker('off', None, None); t.log({'x': 1.0}, 1); t.finish(); "
         "assert 'wandb' not in sys.modules"
     )

@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from mtl_bench import checkpoint
-from mtl_bench.config import Optim, to_dict
-from mtl_bench.curve import data_share
+from mtl_bench.bench.results import write_json
+from mtl_bench.core.config import Optim, to_dict
+from mtl_bench.core.device import Engine, choose_device, seed_for
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.data.loader import train_batches
-from mtl_bench.engine import Engine, choose_device, seed_for
-from mtl_bench.progress import Interrupted, Progress
-from mtl_bench.results import write_json
-from mtl_bench.tracking import Tracker
-from mtl_bench.train import build, schedule, train
+from mtl_bench.train import checkpoint
+from mtl_bench.train.curve import data_share
+from mtl_bench.train.loop import build, schedule, train
+from mtl_bench.train.progress import Interrupted, Progress
+from mtl_bench.train.tracking import Tracker
 
 CPU = torch.device("cpu")
 
@@ -66,12 +66,12 @@ KILLED = """
 import json, os, signal, sys
 from pathlib import Path
 import torch
-from mtl_bench.config import Cell, from_dict
+from mtl_bench.core.config import Cell, from_dict
 from mtl_bench.data.labels import CITYSCAPES20
-from mtl_bench.engine import Engine
-from mtl_bench.progress import Progress
-from mtl_bench.tracking import Tracker
-from mtl_bench.train import train
+from mtl_bench.core.device import Engine
+from mtl_bench.train.progress import Progress
+from mtl_bench.train.tracking import Tracker
+from mtl_bench.train.loop import train
 
 class Dies(Progress):
     def update(self, stage, step, steps, note=""):
@@ -151,7 +151,7 @@ def test_time_spent_waiting_for_batches_is_measured(smoke_cell, smoke_root, tmp_
             time.sleep(0.2)
             yield batch
 
-    monkeypatch.setattr("mtl_bench.train.train_batches", slow)
+    monkeypatch.setattr("mtl_bench.train.loop.train_batches", slow)
     run(smoke_cell, smoke_root, tmp_path / "run")
     rows = curve(tmp_path / "run")
     assert all(200 <= float(row["data_ms"]) < float(row["step_ms"]) for row in rows)

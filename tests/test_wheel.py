@@ -43,7 +43,7 @@ def test_the_wheel_lists_its_own_plugins_from_anywhere(installed, tmp_path):
     text = call(installed / "bin" / "mtl-bench", "list", cwd=tmp_path, env=clean)
     for name in ("fixed_uncertainty", "efficientnet_lite0", "small", "backbones"):
         assert name in text
-    where = "import mtl_bench.plugins as p; print(p.path_of('methods', 'fixed'))"
+    where = "import mtl_bench.core.plugins as p; print(p.path_of('methods', 'fixed'))"
     path = call(installed / "bin" / "python", "-c", where, cwd=tmp_path, env=clean).strip()
     assert path.startswith(str(installed))
     assert "_shipped" in path
@@ -53,6 +53,6 @@ def test_nothing_called_methods_lands_in_site_packages(installed):
     (site,) = installed.glob("lib/python*/site-packages")
     assert not (site / "methods").exists()
     assert not (site / "backbones").exists()
-    assert (site / "mtl_bench" / "recipes" / "small.toml").is_file()
+    assert (site / "mtl_bench" / "bench" / "recipes" / "small.toml").is_file()
     assert (site / "mtl_bench" / "report" / "page.html.j2").is_file()
     assert (site / "mtl_bench" / "figures" / "cloud.html.j2").is_file()

@@ -20,8 +20,8 @@ from kornia.color import rgb_to_grayscale
 from kornia.enhance import adjust_brightness_accumulative, adjust_saturation_with_gray_subtraction
 from torch import Generator, Tensor
 
-from mtl_bench import config
-from mtl_bench.data.targets import OUTSIDE
+from mtl_bench.core import config
+from mtl_bench.tasks.panoptic.targets import OUTSIDE
 
 PADDING_RGB = (123.675 / 255, 116.28 / 255, 103.53 / 255)  # ImageNet's mean colour
 

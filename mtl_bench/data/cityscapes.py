@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data import frame_cache
 from mtl_bench.data.augment import augment as draw_augmented
@@ -26,7 +26,7 @@ from mtl_bench.data.batch import Batch
 from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE, Kind
 from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
-from mtl_bench.data.targets import OUTSIDE, panoptic_targets
+from mtl_bench.tasks.panoptic.targets import OUTSIDE, panoptic_targets
 
 NOT_REPROJECTED = torch.tensor([files.EGO_ID, files.SKY_ID, OUTSIDE])
 PLAIN = config.Augment(flip=False, brightness=0, contrast=0, saturation=0, hue=0)

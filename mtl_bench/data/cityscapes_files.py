@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mtl_bench.data import png
 from mtl_bench.data.labels import KNOWN_LABEL_IDS
-from mtl_bench.data.targets import DIVISOR, LARGEST_ID
+from mtl_bench.tasks.panoptic.targets import DIVISOR, LARGEST_ID
 
 
 @dataclass(frozen=True)

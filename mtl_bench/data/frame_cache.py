@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data import cityscapes_files as files
 
 PLACE = "MTL_BENCH_FRAME_CACHE"

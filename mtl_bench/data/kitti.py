@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.data import frame_cache, velodyne
 from mtl_bench.data import kitti_files as files
 from mtl_bench.data import kitti_splits as splits

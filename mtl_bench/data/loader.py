@@ -14,7 +14,7 @@ import cv2
 import torch
 from torch import Generator, Tensor
 
-from mtl_bench.config import Cell, did_you_mean
+from mtl_bench.core.config import Cell, did_you_mean
 from mtl_bench.data.batch import Batch, collate
 from mtl_bench.data.cityscapes import Cityscapes
 from mtl_bench.data.kitti import Kitti

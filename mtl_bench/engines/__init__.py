@@ -16,7 +16,7 @@ import os
 import shutil
 from typing import TYPE_CHECKING
 
-from mtl_bench.plain import did_you_mean
+from mtl_bench.core.plain import did_you_mean
 
 if TYPE_CHECKING:
     from mtl_bench.engines.base import InferenceEngine

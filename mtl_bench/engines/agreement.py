@@ -11,9 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from mtl_bench.core.geometry import depth_from_inverse
 from mtl_bench.engines.base import Maps
-from mtl_bench.geometry import depth_from_inverse
-from mtl_bench.postprocess import DIVISOR
+from mtl_bench.tasks.panoptic.postprocess import DIVISOR
 
 LIMITS = {  # precision -> least share of equal panoptic pixels, largest median of relative depth
     "fp32": (0.999, 1e-3),

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mtl_bench import config
+from mtl_bench.core import config
 from mtl_bench.engines.base import Maps
-from mtl_bench.finish import Finish
+from mtl_bench.tasks.finish import Finish
 
 
 @dataclass(frozen=True)

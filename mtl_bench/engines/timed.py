@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mtl_bench import engines, latency, provenance
+from mtl_bench import engines, latency
+from mtl_bench.core import provenance
 from mtl_bench.engines import roofline
 from mtl_bench.engines.agreement import Agreement
 from mtl_bench.engines.base import InferenceEngine, Setting

@@ -11,11 +11,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mtl_bench import config, plugins
+from mtl_bench.core import config, plugins
+from mtl_bench.core.backbone import Backbone, Normalize
 from mtl_bench.data.labels import LabelSet
-from mtl_bench.model.backbone import Backbone, Normalize
 from mtl_bench.model.layers import Decoder, GlobalContext, Head, init_fan_in
-from mtl_bench.model.pose import PoseNetwork
+from mtl_bench.tasks.depth.pose import PoseNetwork
 
 
 @dataclass

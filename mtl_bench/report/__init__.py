@@ -100,7 +100,7 @@ def summary_table(rows: "Sequence[Row]", axis: str = "backbone") -> Any:
 
 def _skipped(grid: Grid) -> "list[Row]":
     """The cells that the grid leaves out, as rows that say why."""
-    from mtl_bench.config import to_dict
+    from mtl_bench.core.config import to_dict
 
     names = getattr(grid, "names", {})
     return [

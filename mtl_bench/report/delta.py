@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from mtl_bench.metrics.delta import delta_flat, delta_task
+from mtl_bench.evaluate.delta import delta_flat, delta_task
 from mtl_bench.report.columns import Row
 
 METRICS = {  # key: task, whether higher is better

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from mtl_bench.config import TASKS
+from mtl_bench.core.config import TASKS
 from mtl_bench.report import pareto
 from mtl_bench.report.groups import SMOKE
 from mtl_bench.report.latency_table import LatencyTable, Line

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mtl_bench.config import TASKS
+from mtl_bench.core.config import TASKS
 from mtl_bench.report.columns import Column, Row, measured
 from mtl_bench.report.groups import SMOKE, text
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mtl_bench.plain import did_you_mean, from_dict
+from mtl_bench.core.plain import did_you_mean, from_dict
 from mtl_bench.report import FIGURES
 from mtl_bench.report.columns import BY_NAME, ONLY
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.config import load_recipe, recipe_names, to_dict
+from mtl_bench.core.config import load_recipe, recipe_names, to_dict
 from mtl_bench.report.columns import Column, Row, flatten, measured
 from mtl_bench.report.groups import KNOWN, SMOKE, Entry, Group, axes_of, cell_of, grouped, text
 from mtl_bench.report.published import NUMBERS, TEXTS, Literature

@@ -10,12 +10,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mtl_bench import render
 from mtl_bench.data.labels import CITYSCAPES20, LabelSet
-from mtl_bench.render.depth import RANGES
 from mtl_bench.report.groups import SMOKE
 from mtl_bench.report.style import GRAY, save, styled
 from mtl_bench.report.tables import Table
+from mtl_bench.show import render
+from mtl_bench.show.render.depth import RANGES
 
 IMAGES, IMAGES_OF_MANY = 3, 2
 GROUPS = 6  # more would be too small to see, so they are not all there, and of fewer images

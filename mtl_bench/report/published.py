@@ -10,7 +10,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.plain import did_you_mean, from_dict
+from mtl_bench.core.plain import did_you_mean, from_dict
 from mtl_bench.report.columns import BY_NAME, Column
 
 FOLDER = Path(__file__).parent / "literature"

@@ -13,7 +13,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from mtl_bench.grids import GRIDS
+from mtl_bench.bench.grid import GRIDS
 from mtl_bench.report import FIGURES
 from mtl_bench.report.layout import Layout
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import platformdirs
 
-from mtl_bench.config import Data
+from mtl_bench.core.config import Data
 from mtl_bench.data.layouts import CITYSCAPES, LAYOUTS
 from mtl_bench.data.synthetic.settings import Settings
 from mtl_bench.data.synthetic.workers import render_all

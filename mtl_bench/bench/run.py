@@ -1,0 +1,288 @@
+"""One cell, whole: train, evaluate, time, and the row that says so."""
+
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mtl_bench.bench import results
+from mtl_bench.bench.stored import load_model, time_again, time_cell
+from mtl_bench.core import provenance
+from mtl_bench.core.config import Cell, to_dict
+from mtl_bench.core.device import Engine, choose_device
+from mtl_bench.data.kitti import Kitti
+from mtl_bench.data.labels import labels_of
+from mtl_bench.data.loader import open_dataset
+from mtl_bench.evaluate import pseudo_labels
+from mtl_bench.evaluate.walk import Evaluation, evaluate, open_passes
+from mtl_bench.model import Model
+from mtl_bench.train.curve import data_share, training_time
+from mtl_bench.train.loop import CHECKPOINT, train
+from mtl_bench.train.progress import Interrupted, Progress
+from mtl_bench.train.tracking import Tracker
+
+TAKEN = "taken.json"  # what training took beside the curve's steps, for a run that is continued
+
+
+@dataclass
+class Trained:
+    """A cell's model, and what it took to get it."""
+
+    model: Model
+    time: dict[str, float]  # train_s, step_ms, data_share, peak_mib; of a video cell also pseudo_s
+    protocol: dict[str, Any]
+
+
+def run_cell(
+    cell: Cell,
+    run_dir: Path,
+    root: Path,
+    device: str = "auto",
+    wandb: str = "off",
+    echo: Callable[[str], None] = print,
+) -> dict[str, Any]:
+    """Run what is left of a cell and write its row; every stage can be killed and run again.
+
+    Args:
+        run_dir: the cell's folder, which exists (see `results.begin`).
+        root: the data set.
+        echo: where lines of text go.
+
+    Returns:
+        The row, as `row.json` has it.
+
+    Raises:
+        ValueError: a parent of the cell has no result or no checkpoint, or the data set lacks what
+            its evaluation needs.
+    """
+    engine = Engine(choose_device(device), cell.recipe.optim.precision)
+    progress = Progress(run_dir, echo)
+    progress.catch_signals()
+    tracker = Tracker(wandb, cell, run_dir)
+    code, environment = provenance.code(cell), provenance.environment(engine.device)
+    results.write_json(run_dir / "env.json", environment)
+
+    open_passes(cell, root)  # what would stop the evaluation is told before the training
+    if cell.single_task:
+        trained = _trained_apart(cell, run_dir, engine)
+    else:
+        trained = _train(cell, run_dir, root, engine, progress, tracker)
+    model, took = trained.model, trained.time
+    echo(f"trained in {took['train_s']:.0f} s ({took['step_ms']:.0f} ms a step)")
+
+    evaluation, eval_s = _evaluate(model, cell, root, engine, progress)
+    _save_samples(run_dir / "samples.npz", evaluation.samples)
+
+    progress.update("latency", 0, 1)
+    timing, latency_s = time_cell(model, cell, root, engine, progress.quiet)
+    echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
+
+    row = {
+        **_identity(cell),
+        "metric": {**evaluation.metrics, **timing},
+        "protocol": {**evaluation.protocol, **_training_protocol(cell, root), **trained.protocol},
+        "time": {**took, "eval_s": eval_s, "latency_s": latency_s},
+        "code": code,
+        "env": environment,
+    }
+    tracker.log({key: value for key, value in row["metric"].items() if not isinstance(value, str)})
+    tracker.finish()
+    results.write_json(run_dir / "row.json", row)
+    return row
+
+
+def renew(
+    cell: Cell, run_dir: Path, root: Path, device: str = "auto", echo: Callable[[str], None] = print
+) -> None:
+    """Evaluate and time a trained cell again, as far as its row is of other code; never train.
+
+    A row that an older version stamped is stamped anew where its checkpoint gives back every metric
+    (latency apart), bit for bit. Where it does not, the row is stale for training from then on.
+    """
+    row = results.load_row(run_dir)
+    assert row is not None
+    code, stale = provenance.code(cell), results.changed(row["code"], cell)
+    older = provenance.STAMPED_BEFORE in stale.values()
+    if "evaluate" in stale:
+        if cell.single_task:
+            for parent in cell.parents:
+                _result_of(parent, run_dir.parent)
+        engine = Engine(choose_device(device), cell.recipe.optim.precision)
+        model, progress = load_model(cell, run_dir / CHECKPOINT, engine), Progress(run_dir, echo)
+        evaluation, eval_s = _evaluate(model, cell, root, engine, progress)
+        timing = {k: v for k, v in row["metric"].items() if k.startswith("latency.")}
+        before = {k: v for k, v in row["metric"].items() if k not in timing}
+        after = {key: evaluation.metrics.get(key) for key in before}
+        if older and json.dumps(before) != json.dumps(after):  # as text: NaN equals itself
+            different = sum(json.dumps(before[k]) != json.dumps(after[k]) for k in before)
+            row["code"] = {stage: {} for stage in code}
+            results.write_json(run_dir / "row.json", row)
+            echo(
+                f"{different} of {len(before)} metrics differ from those of the row, which stays "
+                f"as it is: stale, to be trained again"
+            )
+            return
+        row["metric"] = {**evaluation.metrics, **timing}
+        row["protocol"] |= evaluation.protocol
+        if older:
+            echo("every metric is that of the row, which is stamped anew")
+        else:
+            row["time"]["eval_s"] = eval_s
+            row["env_of_evaluation"] = provenance.environment(engine.device)
+            _save_samples(run_dir / "samples.npz", evaluation.samples)
+    again = "time" in stale and not older
+    row["code"] = {**code, "time": row["code"]["time"]} if again else code
+    results.write_json(run_dir / "row.json", row)
+    if again:
+        time_again(cell, run_dir, root, device, echo)
+
+
+def _evaluate(
+    model: Model, cell: Cell, root: Path, engine: Engine, progress: Progress
+) -> tuple[Evaluation, float]:
+    """With the seconds that it took."""
+    start = time.perf_counter()
+    evaluation = evaluate(
+        model, cell, root, engine.device, progress=lambda n, of: progress.update("evaluate", n, of)
+    )
+    eval_s = time.perf_counter() - start
+    progress.say(f"evaluated in {eval_s:.0f} s: {results.headline(evaluation.metrics)}")
+    return evaluation, eval_s
+
+
+# --- training -------------------------------------------------------------------------------------
+
+
+def _train(
+    cell: Cell, run_dir: Path, root: Path, engine: Engine, progress: Progress, tracker: Tracker
+) -> Trained:
+    """Train; a video cell goes on from its parent's checkpoint, with labels that this one made."""
+    taken: dict[str, Any] = results.read_json(run_dir / TAKEN) or {}
+    start = sequence_labels = None
+    protocol = {}
+    if cell.video:
+        _, start = _result_of(cell.parents[0], run_dir.parent)
+        sequence_labels, frames = _pseudo_labels(
+            cell, start, root, run_dir, engine, progress, taken
+        )
+        protocol = {"pseudo_frames": frames}
+    if engine.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(engine.device)
+    labels = labels_of(cell.recipe.data.dataset)
+    given = (cell, labels, root, run_dir, engine, progress, tracker)
+    model = train(*given, start=start, sequence_labels=sequence_labels)
+    taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(engine.device))
+    results.write_json(run_dir / TAKEN, taken)
+    train_s, step_ms = training_time(run_dir / "curve.csv")
+    waited = {"data_share": data_share(run_dir / "curve.csv")}
+    return Trained(model, {"train_s": train_s, "step_ms": step_ms, **waited, **taken}, protocol)
+
+
+def _pseudo_labels(
+    cell: Cell,
+    parent_checkpoint: Path,
+    root: Path,
+    run_dir: Path,
+    engine: Engine,
+    progress: Progress,
+    taken: dict[str, Any],
+) -> tuple[Path, int]:
+    """Make what labels are missing; their folder and number. `taken` gets the seconds."""
+    model = load_model(cell.parents[0], parent_checkpoint, engine)
+    counts: list[int] = []  # of labelled frames: at the start, and after each
+
+    def note(done: int, of: int) -> None:
+        counts.append(done)
+        progress.update("pseudo-label", done, of)
+        if progress.stop_asked:
+            raise Interrupted(f"stopped at pseudo label {done} of {of}, kept in {run_dir}")
+
+    began = time.perf_counter()
+    out = run_dir / "pseudo_labels"
+    folder = pseudo_labels.ensure(model, cell, root, out, engine.device, note)
+    made = counts[-1] - counts[0]
+    if made:  # a run that was killed here made the others, as fast
+        taken["pseudo_s"] = (time.perf_counter() - began) * counts[-1] / made
+        results.write_json(run_dir / TAKEN, taken)
+        progress.say(f"labelled {made} frames in {taken['pseudo_s']:.0f} s")
+    return folder, counts[-1]
+
+
+def _trained_apart(cell: Cell, run_dir: Path, engine: Engine) -> Trained:
+    """The networks of a single-task cell's parents, side by side."""
+    times = [_result_of(parent, run_dir.parent)[0]["time"] for parent in cell.parents]
+    took = {key: sum(time[key] for time in times) for key in ("train_s", "step_ms")}
+    took["peak_mib"] = max(time["peak_mib"] for time in times)
+    return Trained(load_model(cell, run_dir / CHECKPOINT, engine), took, {})
+
+
+def _result_of(parent: Cell, runs: Path) -> tuple[dict[str, Any], Path]:
+    """Row and checkpoint of a cell that another needs.
+
+    Raises:
+        ValueError: it lacks one of them, or they are of other code.
+    """
+    state = results.stored(parent, runs)
+    path = results.run_dir(parent, runs) / CHECKPOINT
+    if not state.trained or state.row is None or not path.is_file():
+        word = "without its checkpoint" if state.trained else state.word
+        why = f" ({state.why})" if state.why else ""
+        raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: run that one again")
+    return state.row, path
+
+
+def _peak_mib(device: torch.device) -> float:
+    """Most memory that training held: of CUDA's allocator, or all that this process ever had."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+def _training_protocol(cell: Cell, root: Path) -> dict[str, Any]:
+    """What kept the sky and the ego vehicle out of the photometric loss; KITTI's frames."""
+    dataset = open_dataset(cell, "train", root, training=True)
+    protocol: dict[str, Any] = {}
+    if isinstance(dataset, Kitti):
+        protocol["training"] = dataset.described
+    if "depth" in cell.tasks:
+        protocol["reprojection_mask"] = dataset.reprojection_mask
+    return protocol
+
+
+def _identity(cell: Cell) -> dict[str, Any]:
+    """What a row says of its cell; rows travel, so a weights file goes without its folder."""
+    values = to_dict(cell)
+    if cell.pretrained is not None:
+        values["pretrained"] = Path(cell.pretrained).name
+    return {
+        "cell_id": cell.id,
+        "slug": cell.slug,
+        "status": "done",
+        "method": cell.method,
+        "backbone": cell.backbone,
+        "tasks": list(cell.tasks),
+        "seed": cell.seed,
+        "video": cell.video,
+        "single_task": cell.single_task,
+        "granularity": cell.granularity,
+        "pretrained": values["pretrained"],
+        "recipe": cell.recipe.name,
+        "smoke": cell.recipe.smoke,
+        "cell": values,
+    }
+
+
+def _save_samples(path: Path, samples: dict[str, Any]) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        np.savez_compressed(file, **samples)
+    temporary.replace(path)

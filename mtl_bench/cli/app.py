@@ -1,0 +1,83 @@
+"""The command line: what the commands are, and what an error, an interruption or a bug becomes.
+
+Exit codes: 0 done, 1 some cell failed, 2 wrong usage or bad input (one line says what), 130
+interrupted. Commands import what they need inside, so that help and lists come at once.
+"""
+
+import errno
+import os
+import signal
+import sys
+import traceback
+from types import FrameType
+from typing import Any, NoReturn
+
+import typer
+from typer.core import TyperGroup
+
+from mtl_bench.cli import cell, data, deploy, figure, grid, look, predict, pseudo
+
+TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # no space, over quota, read-only
+USERS = (FileNotFoundError, PermissionError, NotADirectoryError, IsADirectoryError)
+
+
+class Group(TyperGroup):
+    """Turns what a user can cause into one line and an exit code; a bug keeps its traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as stop:
+            typer.echo(f"interrupted{f': {stop}' if str(stop) else ''}", err=True)
+            raise typer.Exit(130) from None
+        except (ValueError, OSError) as error:
+            if isinstance(error, OSError) and not _is_users(error):
+                raise
+            if os.environ.get(TRACEBACK):
+                traceback.print_exc()
+            typer.echo(f"mtl-bench: {one_line(error)}", err=True)
+            raise typer.Exit(2) from None
+
+
+app = typer.Typer(
+    cls=Group,
+    name="mtl-bench",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Example: mtl-bench ablate --grid backbones",
+)
+for module in (grid, cell, pseudo, predict, figure, deploy, data, look):
+    module.register(app)
+
+
+@app.callback()
+def about() -> None:
+    """Benchmark multi-task learning methods and backbones for driving scenes."""
+
+
+def main() -> None:
+    """The console script; SIGTERM and a closed terminal are interruptions like Ctrl-C."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, _interrupt)  # under nohup it is ignored, and stays so
+    app(prog_name="mtl-bench")
+    sys.exit(0)
+
+
+def one_line(error: Exception) -> str:
+    """An error's message on one line; of an operating-system error, what and which file."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _is_users(error: OSError) -> bool:
+    return isinstance(error, USERS) or error.errno in FULL
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt(signal.Signals(number).name)

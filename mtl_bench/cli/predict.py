@@ -1,0 +1,213 @@
+"""`predict`: what a trained cell sees in a user's images or video."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mtl_bench.cli import options as o
+
+if TYPE_CHECKING:
+    from mtl_bench.show.predict import Predictor
+    from mtl_bench.show.predict.job import Job
+
+CAMERA, OUTPUT = "The camera", "What is written"
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        "predict",
+        rich_help_panel="One cell",
+        epilog="Example: mtl-bench predict --checkpoint runs/NAME drive.mp4 --out predicted",
+    )(predict)
+
+
+def predict(
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="INPUT...", help="Images, folders of images or patterns; or one video."
+        ),
+    ],
+    checkpoint: Annotated[
+        Path, typer.Option(metavar="RUN|CHECKPOINT", help="A folder in runs/, or its last.pt.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="A new folder; it appears when all is done.")
+    ],
+    what: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND,KIND,...",
+            help="Files of each frame: overlay, depth, ids, points. Without it: of images all, of "
+            "a video's frames none.",
+            rich_help_panel=OUTPUT,
+            show_default=False,
+        ),
+    ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.rrd",
+            help="Images, depth and points for the Rerun viewer, too.",
+            rich_help_panel=OUTPUT,
+            show_default=False,
+        ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HxW",
+            help="What images are resized to for the network, in place of its training size.",
+            show_default=False,
+        ),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CAMERA.JSON",
+            help="Intrinsics, height and pitch in Cityscapes' format. Without this or the next "
+            "ones: from the data set that the image lies in, else a guess.",
+            rich_help_panel=CAMERA,
+            show_default=False,
+        ),
+    ] = None,
+    calib: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="KITTI's calib_cam_to_cam.txt; camera 03 for images in a folder image_03, else "
+            "02.",
+            rich_help_panel=CAMERA,
+            show_default=False,
+        ),
+    ] = None,
+    fx: Annotated[
+        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
+    ] = None,
+    fy: Annotated[
+        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
+    ] = None,
+    cx: Annotated[
+        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
+    ] = None,
+    cy: Annotated[
+        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
+    ] = None,
+    camera_height: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M",
+            help="Above the road: depth is in metres then. Where no file knows it either, depth "
+            "is in camera heights.",
+            rich_help_panel=CAMERA,
+            show_default=False,
+        ),
+    ] = None,
+    device: o.DeviceOption = o.Device.auto,
+    plugins: o.PluginsOption = None,
+    quiet: o.QuietOption = False,
+) -> None:
+    """Predict images or a video: panoptic overlay, depth, ids and point cloud, or a video of it."""
+    from mtl_bench.show.predict import job as predictions
+    from mtl_bench.show.predict.cameras import Given
+
+    given = Given(camera, calib, _focal_and_center(fx, fy, cx, cy), camera_height)
+    paths = predictions.find(inputs)
+    video = predictions.is_video(paths)
+    predictor = _predictor(checkpoint, _size(size), device)
+    job = predictions.Job(predictor, given, _kinds(what, video, predictor.cell.tasks))
+    run = predictions.predict_video if video else predictions.predict_images
+    with (
+        predictions.whole_folder(out) as folder,
+        predictions.recorded(job, rerun),
+        _progress(job, quiet),
+    ):
+        record = run(job, paths, folder)
+        record |= {"checkpoint": str(checkpoint), "cell": predictor.cell.slug}
+        predictions.write_record(folder, record)
+    if not quiet:
+        for line in predictions.summary(record, predictor):
+            typer.echo(line)
+        typer.echo(f"{record['frames']} frames, {record['fps']:.1f} FPS: {out}")
+
+
+def _predictor(checkpoint: Path, size: tuple[int, int] | None, device: o.Device) -> "Predictor":
+    """The checkpoint's model, ready to be asked."""
+    from mtl_bench.bench import results
+    from mtl_bench.bench.stored import load_model
+    from mtl_bench.core.device import Engine, choose_device
+    from mtl_bench.show.predict import Predictor
+
+    if not checkpoint.exists():
+        raise ValueError(f"no run or checkpoint '{checkpoint}'")
+    weights = checkpoint / "last.pt" if checkpoint.is_dir() else checkpoint
+    cell = results.load_cell(weights.parent / "cell.json")
+    engine = Engine(choose_device(device.value), cell.recipe.optim.precision)
+    return Predictor(load_model(cell, weights, engine), cell, engine.device, size)
+
+
+def _kinds(what: str | None, video: bool, tasks: tuple[str, ...]) -> list[str]:
+    """The kinds of files that `--what` names, or that the cell's tasks give.
+
+    Raises:
+        ValueError: an unknown kind, or one of a task that the cell lacks.
+    """
+    from mtl_bench.show.predict.files import NEEDS
+
+    if what is None:
+        return [] if video else [kind for kind, task in NEEDS.items() if task in tasks]
+    kinds = [word.strip() for word in what.split(",") if word.strip()]
+    for kind in kinds:
+        if kind not in NEEDS:
+            raise ValueError(f"--what '{kind}' is none of {', '.join(NEEDS)}")
+        if NEEDS[kind] not in tasks:
+            raise ValueError(f"--what {kind} takes the task {NEEDS[kind]}, which the cell lacks")
+    return kinds
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """Raises: ValueError: not HxW."""
+    if text is None:
+        return None
+    height, _, width = text.lower().partition("x")
+    if not (height.isdecimal() and width.isdecimal()):
+        raise ValueError(f"--size '{text}' is not HxW, such as 256x512")
+    return int(height), int(width)
+
+
+def _focal_and_center(
+    fx: float | None, fy: float | None, cx: float | None, cy: float | None
+) -> tuple[float, float, float, float] | None:
+    """Raises: ValueError: some of them and not all."""
+    if fx is None or fy is None or cx is None or cy is None:
+        if (fx, fy, cx, cy) != (None,) * 4:
+            raise ValueError("intrinsics are four numbers: give all of --fx --fy --cx --cy")
+        return None
+    return fx, fy, cx, cy
+
+
+@contextmanager
+def _progress(job: "Job", quiet: bool) -> Iterator[None]:
+    """A bar on stderr with frames a second, while the job runs."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    speed = TextColumn("{task.fields[fps]:.1f} FPS")
+    columns = ("predicting", BarColumn(), MofNCompleteColumn(), speed, TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet) as bar:
+        task = bar.add_task("", total=None, fps=0.0)
+
+        def show(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total or None, fps=job.fps)
+
+        job.progress = show
+        yield

@@ -1,0 +1,269 @@
+"""What a method is, read from its file: source, needs, cost, hyper-parameters; for lists and pages.
+
+Like `plugins.describe`, this reads text and runs nothing: what a base class declares is read from
+its file, too, be it `mtl_bench/core/method.py` or a helper beside the method.
+"""
+
+import ast
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+from mtl_bench.core import plugins
+from mtl_bench.core.plugins import Description
+
+VENUE = re.compile(r"\b([A-Z][A-Za-z]+) ((?:19|20)\d\d)\b")
+PREPRINT = re.compile(r"\barXiv:(\d{4}\.\d{4,5})")
+ADDRESS = re.compile(r"\b(?:https?://)?((?:[a-z]+\.)+[a-z]{2,}/[^\s,;)]+)")
+HEADING = re.compile(r"^(?:Args|Raises):$", re.MULTILINE)
+
+CONTRACT = plugins.PACKAGE / "core" / "method.py"
+LEGEND = (
+    "Cost of a step: F forward pass, B ordinary backward pass. Of each of K losses, H is the "
+    "backward pass through its decoder, T the one through the shared encoder."
+)
+
+
+@dataclass(frozen=True)
+class Card:
+    about: Description
+    formula: str = ""  # the class's docstring, down to its arguments
+    venue: str = ""  # of its source; empty where the file names none
+    year: str = ""
+    url: str = ""
+    needs: str = ""  # losses | gradients | representation; empty in a broken file
+    extras: tuple[str, ...] = ()  # what it asks for beyond that
+    cost: str = ""  # of a step, in the letters of LEGEND
+    settings: Mapping[str, str] = field(default_factory=dict)  # name -> default, as Python text
+
+
+def cards() -> list[Card]:
+    """One for every method that is found, in order of name."""
+    return [_card(about) for about in plugins.describe("methods")]
+
+
+def _card(about: Description) -> Card:
+    line = [] if about.error else _line_in(about.path)
+    if not line:
+        return Card(about)
+    source = _source(about.doc)
+    published = VENUE.search(source)
+    return Card(
+        about,
+        formula=HEADING.split(ast.get_docstring(line[0]) or "")[0].strip(),
+        venue=published[1] if published else "",
+        year=published[2] if published else "",
+        url=_url(source),
+        needs=_needs(line),
+        extras=tuple(_extras(line)),
+        cost=_cost(line),
+        settings=_settings(line),
+    )
+
+
+def _source(doc: str) -> str:
+    """The paragraph that says where a method is from, on one line."""
+    paragraphs = (" ".join(text.split()) for text in doc.split("\n\n"))
+    return next((text for text in paragraphs if text.startswith("Source:")), "")
+
+
+def _url(source: str) -> str:
+    preprint, address = PREPRINT.search(source), ADDRESS.search(source)
+    if preprint:
+        return f"https://arxiv.org/abs/{preprint[1]}"
+    return f"https://{address[1].rstrip('.')}" if address else ""
+
+
+# --- classes as text: a line is a class, its base, the base's base, ... ---------------------------
+
+
+def _line_in(path: Path) -> list[ast.ClassDef]:
+    """The line of the file's method, down to `Method`; empty if no class leads there."""
+    lines = (_line_of(node, path) for node in _classes(path))
+    return next((line for line in lines if line[-1].name == "Method"), [])
+
+
+def _line_of(node: ast.ClassDef, path: Path) -> list[ast.ClassDef]:
+    for base in node.bases:
+        name = ast.unparse(base).rpartition(".")[2]
+        for place in (path, *_beside(path), CONTRACT):
+            for found in _classes(place):
+                if found.name == name and found is not node:
+                    return [node, *_line_of(found, place)]
+    return [node]
+
+
+def _beside(path: Path) -> Iterator[Path]:
+    """The files that `from .name import ...` reads."""
+    for node in _tree(path).body:
+        if isinstance(node, ast.ImportFrom) and node.level == 1 and node.module:
+            beside = path.with_name(f"{node.module}.py")
+            if beside.is_file():
+                yield beside
+
+
+def _classes(path: Path) -> list[ast.ClassDef]:
+    return [node for node in _tree(path).body if isinstance(node, ast.ClassDef)]
+
+
+def _tree(path: Path) -> ast.Module:
+    return _parse(path.read_bytes())
+
+
+@cache
+def _parse(text: bytes) -> ast.Module:
+    return ast.parse(text)
+
+
+# --- what a line of classes declares --------------------------------------------------------------
+
+
+def _declared(line: Sequence[ast.ClassDef]) -> dict[str, object]:
+    """Class attributes with a constant value; the nearest class counts."""
+    values: dict[str, object] = {}
+    for node in reversed(line):
+        for item in node.body:
+            if isinstance(item, ast.Assign) and isinstance(item.value, ast.Constant):
+                values |= {ast.unparse(target): item.value.value for target in item.targets}
+            elif isinstance(item, ast.AnnAssign) and isinstance(item.value, ast.Constant):
+                values[ast.unparse(item.target)] = item.value.value
+    return values
+
+
+def _definitions(line: Sequence[ast.ClassDef], name: str) -> list[ast.FunctionDef]:
+    """Of a function, the nearest first."""
+    items = [item for node in line for item in node.body]
+    return [item for item in items if isinstance(item, ast.FunctionDef) and item.name == name]
+
+
+def _is_a(line: Sequence[ast.ClassDef], base: str) -> bool:
+    return base in [node.name for node in line]
+
+
+def _needs(line: Sequence[ast.ClassDef]) -> str:
+    if _is_a(line, "LossMethod"):
+        return "losses"
+    return "representation" if _declared(line).get("space") == "representation" else "gradients"
+
+
+def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
+    values = _declared(line)
+    if values["reevaluates"]:
+        yield "the losses after the step"
+    if _is_a(line, "LookAheadMethod"):
+        yield "the gradients of a second batch ahead"
+    elif values["batches"] != 1:
+        yield f"{values['batches']} batches"
+    own_heads = values.get("weighted_heads") or len(_definitions(line, "head_weights")) > 1
+    if own_heads or _is_a(line, "Composed"):
+        yield "weighted decoders"
+
+
+def _cost(line: Sequence[ast.ClassDef]) -> str:
+    """As `backward` spends it; what the method itself computes is not in it."""
+    values, needs = _declared(line), _needs(line)
+    if needs == "losses":
+        return "2F + 1B" if values["reevaluates"] else "1F + 1B"
+    if _is_a(line, "CrossMethod"):  # decoders' own parameters only of the third
+        return "3F + 2K(H + T) + KH + 1T"
+    batches = values["batches"]
+    each = "" if batches == 1 else batches
+    if needs == "representation":
+        return f"{batches}F + {each}KH + {batches}T"
+    return f"{batches}F + {each}K(H + T)"
+
+
+def _settings(line: Sequence[ast.ClassDef]) -> dict[str, str]:
+    """Arguments of the constructor that the harness leaves alone."""
+    arguments = _definitions(line, "__init__")[0].args
+    plain = [*arguments.posonlyargs, *arguments.args]
+    plain = plain[len(plain) - len(arguments.defaults) :]  # all but `self` and `terms` have one
+    pairs = [
+        *zip(plain, arguments.defaults, strict=True),
+        *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True),
+    ]
+    return {
+        argument.arg: ast.unparse(default)
+        for argument, default in pairs
+        if default is not None and argument.arg not in plugins.GIVEN
+    }
+
+
+# --- text -----------------------------------------------------------------------------------------
+
+HEAD = ["name", "year", "venue", "needs", "cost", ""]
+
+
+def rows(found: Iterable[Card]) -> list[list[str]]:
+    """A head and a row a method, for aligned columns."""
+    body = [
+        [card.about.name, card.year, card.venue, card.needs, card.cost, _one_line(card)]
+        for card in found
+    ]
+    return [HEAD, *body]
+
+
+def details(card: Card) -> list[str]:
+    """Where it was published, what it needs, its hyper-parameters; a line each."""
+    lines = [" ".join(filter(None, (card.venue, card.year, card.url)))]
+    if card.needs:
+        lines.append(f"needs {', '.join((card.needs, *card.extras))}; cost {card.cost}")
+    lines.append(", ".join(f"{key}={default}" for key, default in card.settings.items()))
+    return [line for line in lines if line]
+
+
+PAGE = """# Weighting methods
+
+One method a file: its docstring has the source, what departs from it and where public code differs.
+A loss-value method and a gradient method together are a method, too: `--method a+b`. This page is
+written by `mtl-bench list methods --markdown`.
+
+{table}
+
+{legend}
+
+## Formulas and hyper-parameters
+
+L losses, w weights, g gradients, J and G their matrix and Gramian, d the update direction of what
+is shared. Hyper-parameters are set with `--set method.NAME=VALUE`.
+
+{sections}"""
+
+
+def page(found: Iterable[Card], folder: Path) -> str:
+    """Markdown: a table of methods, then each one's formula and hyper-parameters.
+
+    Args:
+        folder: where the page will lie, which links to the files lead from.
+    """
+    found = list(found)
+    head = ["method", "source", "needs", "cost per step", "what it does"]
+    lines = [head, ["---"] * len(head), *(_table_row(card, folder) for card in found)]
+    return PAGE.format(
+        table="\n".join(f"| {' | '.join(line)} |" for line in lines),
+        legend=LEGEND,
+        sections="\n".join(map(_section, found)),
+    )
+
+
+def _table_row(card: Card, folder: Path) -> list[str]:
+    target = Path(os.path.relpath(card.about.path, folder)).as_posix()
+    source = f"{card.venue} {card.year}".strip()
+    cells = [source, card.needs, card.cost, _one_line(card)]
+    return [f"[{card.about.name}]({target})", *(cell.replace("|", r"\|") for cell in cells)]
+
+
+def _section(card: Card) -> str:
+    formula = f"```text\n{card.formula}\n```\n" if card.formula else ""
+    settings = ", ".join(f"`{key}={default}`" for key, default in card.settings.items())
+    notes = [f"Source: <{card.url}>." if card.url else ""]
+    notes += [f"Needs {', '.join((card.needs, *card.extras))}." if card.needs else ""]
+    notes += [f"Hyper-parameters: {settings}." if settings else ""]
+    return f"### {card.about.name}\n\n{formula}\n{' '.join(filter(None, notes))}\n"
+
+
+def _one_line(card: Card) -> str:
+    return f"BROKEN: {card.about.error}" if card.about.error else card.about.summary

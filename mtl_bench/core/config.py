@@ -1,0 +1,200 @@
+"""What a training run is: frozen dataclasses, one canonical JSON, one id.
+
+A `Recipe` is everything about training that is not the method, the backbone or the seed; a `Cell`
+is a recipe with those three, the tasks and the video stage. Two cells with the same values have
+the same id, whatever file or option the values came from.
+"""
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from mtl_bench.core.plain import did_you_mean, from_dict, to_dict
+from mtl_bench.core.recipe import (
+    Augment,
+    Data,
+    Evaluate,
+    Latency,
+    Loss,
+    Network,
+    Optim,
+    PseudoLabels,
+    Recipe,
+)
+
+__all__ = ["Augment", "Data", "Evaluate", "Latency", "Loss", "Network", "Optim", "PseudoLabels"]
+__all__ += ["Cell", "Recipe", "canonical_json", "load_recipe", "override", "recipe_names"]
+__all__ += ["did_you_mean", "from_dict", "set_values", "to_dict"]
+
+PROTOCOL = 2  # raised when numbers made before stop being comparable with numbers made after
+RECIPES = Path(__file__).parents[1] / "bench" / "recipes"
+TASKS = ("panoptic", "depth")
+GRANULARITIES = ("terms", "tasks")
+# Values that recipes have had since protocol 2 began. One that is its default is left out of the
+# canonical JSON, so that cells which were run before keep their ids.
+LATER: tuple[tuple[str, str], ...] = (  # section, key
+    ("data", "train_frames"),
+    ("data", "test_scenes"),
+    ("evaluate", "protocol"),
+    ("evaluate", "also"),
+    ("evaluate", "flip"),
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run and its evaluation.
+
+    Two kinds of cell need others (their `parents`) first: `video` trains its parent's checkpoint
+    on, with pseudo labels from it; `single_task` trains nothing, and evaluates and times the
+    networks of its parents together.
+
+    Raises:
+        ValueError: an unknown granularity, or options that exclude each other.
+    """
+
+    recipe: Recipe
+    backbone: str
+    method: str  # a name, or a loss-value method and a gradient method: a+b
+    tasks: tuple[str, ...] = TASKS
+    seed: int = 0
+    video: bool = False  # the second training, on pseudo-labeled frames too
+    single_task: bool = False  # one network a task, each trained alone
+    granularity: str = "terms"  # what a method weighs: the loss terms, or tasks of fixed weights
+    pretrained: str | None = None  # initial weights: None = random | "timm" | a file
+    method_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    backbone_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        if self.granularity not in GRANULARITIES:
+            known = did_you_mean(self.granularity, GRANULARITIES)
+            raise ValueError(f"no granularity '{self.granularity}'{known}")
+        if self.single_task and self.video:
+            raise ValueError(
+                "single_task and video exclude each other: the stage needs one network"
+            )
+        if self.single_task and len(self.tasks) < 2:
+            raise ValueError(f"single_task needs two tasks or more, not {list(self.tasks)}")
+        if self.video and "panoptic" not in self.tasks:
+            raise ValueError("video needs the task panoptic: its labels are what the stage makes")
+
+    @property
+    def parents(self) -> tuple["Cell", ...]:
+        """Cells whose checkpoints this one needs."""
+        if self.single_task:
+            return tuple(replace(self, single_task=False, tasks=(task,)) for task in self.tasks)
+        return (replace(self, video=False),) if self.video else ()
+
+    @property
+    def id(self) -> str:
+        """12 hexadecimal digits of the canonical JSON: recipe values, not the recipe's name."""
+        return hashlib.sha256(canonical_json(self).encode()).hexdigest()[:12]
+
+    @property
+    def slug(self) -> str:
+        """Name of the run's folder."""
+        return f"{self.method}-{self.backbone}-s{self.seed}-{self.id}"
+
+
+# --- identity -----------------------------------------------------------------------------------
+
+
+def canonical_json(cell: Cell) -> str:
+    """What makes a cell itself: without names, prose and how often a checkpoint is written."""
+    values = to_dict(cell)
+    for key in ("name", "about"):
+        del values["recipe"][key]
+    for key in ("checkpoint_every", "cosine_every"):
+        del values["recipe"]["optim"][key]
+    if not cell.video:
+        del values["recipe"]["pseudo"]
+    for key in ("cache", "workers"):
+        del values["recipe"]["data"][key]
+    defaults = to_dict(Recipe())
+    for section, key in LATER:
+        if values["recipe"][section][key] == defaults[section][key]:
+            del values["recipe"][section][key]
+    if cell.pretrained not in (None, "timm"):
+        values["pretrained"] = _content_hash(Path(str(cell.pretrained)))
+    return json.dumps({"protocol": PROTOCOL, **values}, sort_keys=True, separators=(",", ":"))
+
+
+@lru_cache
+def _content_hash(weights: Path) -> str:
+    """A weights file counts by what is in it, not by where it is."""
+    if not weights.is_file():
+        raise ValueError(f"no weights file '{weights}'; --pretrained takes 'timm' or a file")
+    with weights.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# --- recipes and overrides ------------------------------------------------------------------------
+
+
+def recipe_names() -> list[str]:
+    return sorted(path.stem for path in RECIPES.glob("*.toml"))
+
+
+def load_recipe(name: str) -> Recipe:
+    """A shipped recipe by name, or a user's by the path of its TOML file.
+
+    Raises:
+        ValueError: no such recipe, or a key or value that a recipe cannot have.
+    """
+    path = Path(name) if name.endswith(".toml") else RECIPES / f"{name}.toml"
+    if not path.is_file():
+        raise ValueError(f"no recipe called '{name}'{did_you_mean(name, recipe_names())}")
+    try:
+        values = tomllib.loads(path.read_text())
+        return from_dict(Recipe, {"name": path.stem, **values})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def override(cell: Cell, settings: Iterable[str]) -> Cell:
+    """Apply `key=value` strings: `recipe.optim.lr=3e-4`, `method.alpha=1.5`, `seed=3`.
+
+    Raises:
+        ValueError: no `=`, an unknown key (with the nearest known one), or a value of another type.
+    """
+    values = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals:
+            raise ValueError(f"'{setting}' is not key=value, such as recipe.optim.lr=3e-4")
+        values[key.strip()] = _parse(text.strip())
+    return set_values(cell, values)
+
+
+def set_values(cell: Cell, settings: Mapping[str, Any]) -> Cell:
+    """As `override`, with values as they are; below `method.` and `backbone.` sections are made."""
+    values = to_dict(cell)
+    for key, value in settings.items():
+        *sections, last = key.split(".")
+        plug_in = sections[:1] in (["method"], ["backbone"])  # checked when it is constructed
+        if plug_in:
+            sections[0] += "_args"
+        target = values
+        for section in sections:
+            inner = target.setdefault(section, {}) if plug_in else target.get(section)
+            if not isinstance(inner, dict):
+                raise ValueError(f"unknown key '{key}'{did_you_mean(section, target)}")
+            target = inner
+        if last not in target and not plug_in:
+            raise ValueError(f"unknown key '{key}'{did_you_mean(last, target)}")
+        target[last] = to_dict(value)
+    return from_dict(Cell, values)
+
+
+def _parse(text: str) -> Any:
+    """A TOML value, or the text itself where it is not one: `lr=1e-3`, `dataset=cityscapes`."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

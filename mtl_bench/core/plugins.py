@@ -1,0 +1,285 @@
+"""Finds, describes and loads the files in methods/ and backbones/; their stems are the names.
+
+Searched in this order: the package's own folders (the checkout's, or those inside an installed
+wheel), `./methods` and `./backbones` of the working directory, and what `--plugins` names: a
+folder with those two in it, a folder of plug-ins of either kind, or one file. A file reached twice
+counts once. `_name.py` is a helper that its neighbours import with `from ._name import ...`.
+
+Finding and describing read the files as text; only `load` runs one.
+"""
+
+import ast
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import os
+import re
+import sys
+import traceback
+import types
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mtl_bench.core.config import TASKS, Cell, did_you_mean
+
+KINDS = ("methods", "backbones")
+PACKAGE = Path(__file__).resolve().parents[1]
+VARIABLE = "MTL_BENCH_PLUGINS"  # what --plugins adds to; the processes that run cells inherit it
+
+BASES = {
+    "methods": ("mtl_bench.core.method", "Method"),
+    "backbones": ("mtl_bench.core.backbone", "Backbone"),
+}
+GIVEN = ("self", "terms", "seed", "strides", "pretrained")  # the harness fills these arguments in
+NAME = re.compile(r"[a-z][a-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class Description:
+    name: str
+    summary: str  # first line of the file's docstring
+    path: Path
+    error: str | None = None  # why it cannot be chosen
+    doc: str = ""
+
+
+# --- finding --------------------------------------------------------------------------------------
+
+
+def add_folder(path: Path | str) -> None:
+    """Search a folder (or one file) too, in this process and in those that it starts.
+
+    Raises:
+        ValueError: no such folder, or a path that a list of paths cannot hold.
+    """
+    place = Path(path).resolve()
+    if not (place.is_dir() or (place.suffix == ".py" and place.is_file())):
+        raise ValueError(f"no plug-in folder or file '{path}'")
+    if os.pathsep in str(place):
+        raise ValueError(f"plug-in folder '{place}': its path may not contain '{os.pathsep}'")
+    known = [p for p in os.environ.get(VARIABLE, "").split(os.pathsep) if p]
+    if str(place) not in known:
+        os.environ[VARIABLE] = os.pathsep.join([*known, str(place)])
+
+
+def folders(kind: str) -> list[Path]:
+    """Where plug-ins of a kind are searched, in order; only those that exist."""
+    shipped = PACKAGE / "_shipped"
+    own = shipped if shipped.is_dir() else PACKAGE.parent
+    extra = [Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep) if p]
+    found = [root / kind for root in (own, Path.cwd(), *extra)] + [p for p in extra if p.is_dir()]
+    return list(dict.fromkeys(p.resolve() for p in found if p.is_dir()))
+
+
+def files(kind: str) -> dict[str, Path]:
+    """Name -> file; the first where two folders have the same name (`path_of` refuses those)."""
+    return {name: paths[0] for name, paths in _candidates(kind).items()}
+
+
+def path_of(kind: str, name: str) -> Path:
+    """The file of a plug-in.
+
+    Raises:
+        ValueError: an unknown name, or one that two files have.
+    """
+    word, paths = kind[:-1], _candidates(kind).get(name)
+    if paths is None:
+        raise ValueError(
+            f"no {word} called '{name}'{did_you_mean(name, files(kind))}; "
+            f"to add it, write {kind}/{name}.py (mtl-bench new {word} {name})"
+        )
+    if len(paths) > 1:
+        raise ValueError(f"two {kind} are called '{name}': {paths[0]} and {paths[1]}; rename one")
+    return paths[0]
+
+
+def kinds_of(name: str) -> list[str]:
+    """The kinds that have a plug-in of this name."""
+    return [kind for kind in KINDS if name in _candidates(kind)]
+
+
+def _candidates(kind: str) -> dict[str, list[Path]]:
+    found: dict[str, list[Path]] = {}
+    paths = [path for folder in folders(kind) for path in sorted(folder.glob("[!_.]*.py"))]
+    extra = (Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep))
+    paths += [path for path in extra if path.is_file()]
+    for path in dict.fromkeys(path.resolve() for path in paths):
+        if _kind_of(path) == kind:
+            found.setdefault(path.stem, []).append(path)
+    return dict(sorted(found.items()))
+
+
+def _kind_of(path: Path) -> str | None:
+    """By the folder's name; in a folder of another name, by what the file imports."""
+    if path.parent.name in KINDS:
+        return path.parent.name
+    text = path.read_text(encoding="utf-8", errors="replace")
+    for kind, (module, base) in BASES.items():
+        last = module.rpartition(".")[2]
+        imports = (
+            rf"^\s*(from\s+{module}\b|import\s+{module}\b|from\s+mtl_bench\s+import\s+{last}\b)"
+        )
+        if re.search(imports, text, re.MULTILINE) and base in text:
+            return kind
+    return None
+
+
+# --- describing -----------------------------------------------------------------------------------
+
+
+def describe(kind: str) -> list[Description]:
+    """Every plug-in of a kind, in order of name, without importing any."""
+    return [_describe(name, paths) for name, paths in _candidates(kind).items()]
+
+
+def _describe(name: str, paths: list[Path]) -> Description:
+    path = paths[0]
+    try:
+        tree = ast.parse(path.read_bytes(), str(path))
+    except (SyntaxError, ValueError) as error:  # ValueError: null bytes
+        line = f" (line {error.lineno})" if isinstance(error, SyntaxError) else ""
+        return Description(name, "", path, f"{type(error).__name__}: {error.args[0]}{line}")
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    doc = ast.get_docstring(tree) or next(filter(None, map(ast.get_docstring, classes)), "")
+    missing = sorted(_imports(tree) - {name for name in _imports(tree) if _installed(name)})
+    wrong = None
+    if len(paths) > 1:
+        wrong = f"two files have this name: {paths[0]} and {paths[1]}"
+    elif not NAME.fullmatch(name):
+        wrong = f"'{name}' is no name: lower-case letters, digits and _"
+    elif not classes:
+        wrong = "defines no class"
+    elif missing:
+        wrong = f"needs {', '.join(missing)}, not installed here"
+    return Description(name, doc.partition("\n")[0], path, wrong, doc)
+
+
+def _imports(tree: ast.Module) -> set[str]:
+    """Top-level packages that the file imports when it is loaded."""
+    names: set[str] = set()
+    for node in tree.body:
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+def _installed(package: str) -> bool:
+    return package in sys.modules or importlib.util.find_spec(package) is not None
+
+
+# --- loading --------------------------------------------------------------------------------------
+
+
+def load(kind: str, name: str) -> type[Any]:
+    """The class of a plug-in.
+
+    Raises:
+        ValueError: unknown or ambiguous name, a file that fails to import (with its line), or one
+            that does not define exactly one subclass of `Method` (`Backbone`).
+    """
+    path = path_of(kind, name)
+    base_module, base_name = BASES[kind]
+    base = getattr(importlib.import_module(base_module), base_name)
+    package = f"mtl_bench_plugins_{hashlib.sha256(str(path.parent).encode()).hexdigest()[:8]}"
+    if package not in sys.modules:  # a package per folder: relative imports work, nothing leaks out
+        sys.modules[package] = types.ModuleType(package)
+        sys.modules[package].__path__ = [str(path.parent)]
+    module_name, version = f"{package}.{name}", fingerprint(kind, name)
+    if getattr(sys.modules.get(module_name), "_fingerprint", version) != version:
+        for loaded in [m for m in sys.modules if m.startswith(f"{package}.")]:
+            del sys.modules[loaded]  # edited since: an open session sees the new file
+    importlib.invalidate_caches()
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        line = next(
+            (
+                f", line {f.lineno}"
+                for f in reversed(traceback.extract_tb(error.__traceback__))
+                if f.filename == str(path)
+            ),
+            "",
+        )
+        raise ValueError(f"{path}{line}: {type(error).__name__}: {error}") from error
+    vars(module)["_fingerprint"] = version
+    own = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module_name]
+    found = list(dict.fromkeys(c for c in own if issubclass(c, base)))
+    if len(found) != 1:
+        names = ", ".join(c.__name__ for c in found) or "none"
+        raise ValueError(f"{path} must define one subclass of {base_name}, and defines {names}")
+    return found[0]
+
+
+def part_names(method: str) -> list[str]:
+    """The names in `a` or in a composition `a+b`."""
+    return method.split("+")
+
+
+def fingerprint(kind: str, name: str) -> str:
+    """12 hexadecimal digits of the file (or of both files of `a+b`) and the helpers it imports."""
+    digest = hashlib.sha256()
+    for part in part_names(name):
+        for path in _with_helpers(path_of(kind, part)):
+            digest.update(path.read_bytes().replace(b"\r\n", b"\n") + b"\0")
+    return digest.hexdigest()[:12]
+
+
+def _with_helpers(path: Path) -> list[Path]:
+    """A file and the `_*.py` beside it that it imports, directly or through another."""
+    found, left = {path}, [path]
+    while left:
+        for helper in re.findall(r"^\s*from \.(\w+) import", left.pop().read_text(), re.MULTILINE):
+            beside = path.with_name(f"{helper}.py")
+            if beside.is_file() and beside not in found:
+                found.add(beside)
+                left.append(beside)
+    return sorted(found)
+
+
+def settings(kind: str, name: str) -> dict[str, Any]:
+    """Hyper-parameters -> defaults: the constructor's arguments that the harness leaves alone."""
+    parameters = inspect.signature(load(kind, name).__init__).parameters.values()
+    return {p.name: p.default for p in parameters if p.name not in GIVEN}
+
+
+def check_cells(cells: Iterable[Cell]) -> None:
+    """What cells name exists: tasks, plug-ins and the hyper-parameters that are set.
+
+    Raises:
+        ValueError: an unknown task, plug-in or hyper-parameter, with the nearest known one.
+    """
+    seen: set[tuple[str, str, tuple[str, ...]]] = set()
+    for cell in cells:
+        for task in cell.tasks:
+            if task not in TASKS:
+                raise ValueError(f"no task called '{task}'{did_you_mean(task, TASKS)}")
+        if not cell.tasks:
+            raise ValueError(f"a cell needs a task: {', '.join(TASKS)}")
+        for kind, name, values in _chosen(cell):
+            if (kind, name, tuple(values)) in seen:
+                continue
+            seen.add((kind, name, tuple(values)))
+            path_of(kind, name)
+            known = settings(kind, name) if values else {}  # importing torch takes seconds
+            for key in values:
+                if key not in known:
+                    word = kind[:-1]
+                    raise ValueError(f"{word} '{name}' has no '{key}'{did_you_mean(key, known)}")
+
+
+def _chosen(cell: Cell) -> list[tuple[str, str, Mapping[str, Any]]]:
+    """Kind, name and settings of a cell's plug-ins; of `a+b`, settings come by part."""
+    names = part_names(cell.method)
+    parts = {names[0]: cell.method_args} if len(names) == 1 else dict(cell.method_args)
+    for name in parts:
+        if name not in names:
+            raise ValueError(
+                f"method '{cell.method}' has no part '{name}': --set method.{names[0]}.KEY=VALUE"
+            )
+    methods = [("methods", name, parts.get(name, {})) for name in names]
+    return [*methods, ("backbones", cell.backbone, cell.backbone_args)]

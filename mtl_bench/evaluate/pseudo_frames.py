@@ -1,0 +1,183 @@
+"""Which frames get pseudo labels, and how these lie on disk: one class a layout.
+
+Cityscapes: frames of the sequences without human labels, into a folder of their own.
+
+    <out>/gtFine/<split>/<city>/<name>_gtFine_labelIds.png      8 bits
+    <out>/gtFine/<split>/<city>/<name>_gtFine_instanceIds.png   16 bits, written last: frame done
+
+KITTI: the split's frames, beside their images. No class there is the ego vehicle: unlabeled.
+
+    <out>/<date>/<drive>/label_02|03/data/<10 digits>.png       16 bits, Cityscapes' instance ids
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mtl_bench.core import config
+from mtl_bench.data import cityscapes_files as files
+from mtl_bench.data import kitti_files, kitti_splits, png
+from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, Kind
+from mtl_bench.data.layouts import KITTI, layout_of
+from mtl_bench.tasks.panoptic.targets import DIVISOR
+
+LABEL_IDS = Kind("gtFine", "_gtFine_labelIds.png", "label map", 8)
+
+Size = tuple[int, int]  # height, width
+
+
+class Group(NamedTuple):
+    """Frames of one size, in order."""
+
+    names: list[str]
+    size: Size  # of the network's input at scale 1
+
+
+class Frames(Protocol):
+    """What the maker of labels needs to know of a data set."""
+
+    names: list[str]  # of the frames to label
+    out: Path  # where the record lies
+    folder: Path  # where the labels lie, for whoever reads them
+
+    def groups(self) -> Iterator[Group]: ...
+    def image(self, name: str) -> Path: ...
+    def done(self) -> set[str]:
+        """Names of the frames that are labelled."""
+        ...
+
+    def stranger(self) -> Path | None:
+        """A label file in `out`, where there is one."""
+        ...
+
+    def record(self) -> dict[str, Any]:
+        """What tells these labels from those of other frames or of another input."""
+        ...
+
+    def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None: ...
+
+
+def frames_of(root: Path, out: Path | None, split: str, recipe: config.Recipe) -> Frames:
+    """The frames of a split to label.
+
+    Args:
+        out: where labels go; None: beside KITTI's images.
+
+    Raises:
+        ValueError: no frame to label, or no place for labels.
+    """
+    if layout_of(root) == KITTI:
+        return KittiFrames(root, out or root, split, recipe)
+    if out is None:
+        raise ValueError("say where the labels go, --out DIR: a new or empty folder")
+    return CityscapesFrames(root, out, split, recipe)
+
+
+class CityscapesFrames:
+    """Frames of `leftImg8bit_sequence` that have both neighbours and no human label."""
+
+    def __init__(self, root: Path, out: Path, split: str, recipe: config.Recipe) -> None:
+        self.source, self.out = root / SEQUENCE.folder / split, out
+        self.folder = out / LABELS.folder / split
+        self.size = (recipe.data.height, recipe.data.width)
+        self.names = files.unlabelled_names(root, split)
+        if not self.names:
+            raise ValueError(
+                f"{self.source}: no frame without a human label that has both neighbours; unpack "
+                f"{SEQUENCE.package}, or render the built-in scenes with recipe.data.frames=4 or "
+                f"more"
+            )
+        if self.folder.resolve().is_relative_to((root / LABELS.folder).resolve()):
+            raise ValueError(f"{out}: the data set's own labels belong there; choose another --out")
+
+    def groups(self) -> Iterator[Group]:
+        yield Group(self.names, self.size)
+
+    def image(self, name: str) -> Path:
+        return files.file_of(self.source, SEQUENCE, name)
+
+    def done(self) -> set[str]:
+        return files.names_in(self.folder, LABELS).intersection(self.names)
+
+    def stranger(self) -> Path | None:
+        return next(self.out.rglob("*_gtFine_*"), None)
+
+    def record(self) -> dict[str, Any]:
+        first = self.image(min(files.names_in(self.source, SEQUENCE)))
+        return {
+            "split": self.source.name,
+            "first frame": hashlib.sha256(first.read_bytes()).hexdigest(),  # tells data sets apart
+            "input": list(self.size),
+        }
+
+    def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None:
+        label_HW = np.where(ids_HW < DIVISOR, ids_HW, ids_HW // DIVISOR).astype(np.uint8)
+        for kind, array in ((LABEL_IDS, label_HW), (LABELS, ids_HW)):
+            write(files.file_of(self.folder, kind, name), _encoded(array))
+
+
+class KittiFrames:
+    """A split's frames that have an image, or all of the tree's; each day's at its own size."""
+
+    def __init__(self, root: Path, out: Path, split: str, recipe: config.Recipe) -> None:
+        self.out = self.folder = out
+        self.stride = recipe.network.strides[-1]
+        self.tree, self._labels = kitti_files.Tree(root), kitti_files.Tree(root, labels=out)
+        if split == "all":
+            frames = list(self.tree.frames())
+        else:
+            listed = kitti_splits.frames_of(root, split)
+            frames = [frame for frame in listed if self.tree.has_image(frame)]
+        if not frames:
+            raise ValueError(
+                f"{root}: none of the frames of the split {split}; '--split all' labels every frame"
+            )
+        self._frames = {frame.name: frame for frame in frames}
+        self.names = list(self._frames)
+
+    def groups(self) -> Iterator[Group]:
+        for _, names in groupby(self.names, lambda name: name[:10]):
+            day = list(names)
+            header = png.read_header(self.image(day[0]))
+            yield Group(day, (self._divisible(header.height), self._divisible(header.width)))
+
+    def _divisible(self, length: int) -> int:
+        return max(round(length / self.stride), 1) * self.stride
+
+    def image(self, name: str) -> Path:
+        return self.tree.image(self._frames[name])
+
+    def done(self) -> set[str]:
+        return {name for name, frame in self._frames.items() if self._labels.has_labels(frame)}
+
+    def stranger(self) -> Path | None:
+        return next(self.out.glob("*/*/label_0[23]/data/*.png"), None)
+
+    def record(self) -> dict[str, Any]:
+        return {"input": "the frames' own size"}  # of any split: frames' names tell them apart
+
+    def write(self, name: str, ids_HW: NDArray[np.uint16]) -> None:
+        ids_HW = np.where(ids_HW == files.EGO_ID, np.uint16(0), ids_HW)
+        write(self._labels.labels(self._frames[name]), _encoded(ids_HW))
+
+
+def _encoded(array_HW: NDArray) -> bytes:
+    return cv2.imencode(".png", array_HW)[1].tobytes()
+
+
+def write(path: Path, content: bytes) -> None:
+    """Whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)

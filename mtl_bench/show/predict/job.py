@@ -1,0 +1,249 @@
+"""Predictions for a user's images or video: from files through the model into a folder.
+
+    <out>/prediction.json    input, cameras, scale, model, speed; the units of the other files
+    <out>/NAME_...           of images, see prediction_files
+    <out>/NAME.mp4           of a video: panoptic map and depth side by side
+    <out>/NAME_000000_...    of a video's frames, where they are asked for
+
+One frame is in memory at a time. The folder appears under its name, whole, at the very end.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mtl_bench.show.predict import Image, Predicted, Predictor
+from mtl_bench.show.predict.cameras import Given, Mounted, camera_of
+from mtl_bench.show.predict.files import video_frame, write_files
+from mtl_bench.show.predict.recording import Recording, missing
+from mtl_bench.show.predict.video import IMAGE_SUFFIXES, Reader, Writer, is_image, read_image
+
+RECORD = "prediction.json"
+Progress = Callable[[int, int], None]  # frames done, frames in all (0: not known)
+
+
+@dataclass
+class Job:
+    """What is done with every frame, and what came of it so far."""
+
+    predictor: Predictor
+    given: Given
+    kinds: Collection[str]  # of prediction_files.KINDS; what the cell's tasks lack is left out
+    recording: Recording | None = None
+    progress: Progress | None = None
+    frames: int = 0
+    predict_s: float = 0.0
+    scales: Counter = field(default_factory=Counter)  # "m by road": frames
+    began: float = field(default_factory=time.perf_counter)
+
+    def predict(self, name: str, image_HW3: Image, camera: Mounted) -> Predicted:
+        """Predict a frame, count it, and log it where there is a recording."""
+        start = time.perf_counter()
+        predicted = self.predictor(image_HW3, camera.K_33, camera.height_m, camera.pitch_rad)
+        self.predict_s += time.perf_counter() - start
+        if predicted.unit is not None:
+            self.scales[_scale_in_words(predicted)] += 1
+        if self.recording is not None:
+            self.recording.add(self.frames, name, predicted)
+        return predicted
+
+    def done(self, total: int) -> None:
+        """A frame and its files."""
+        self.frames += 1
+        if self.progress is not None:
+            self.progress(self.frames, total)
+
+    @property
+    def fps(self) -> float:
+        return self.frames / (time.perf_counter() - self.began)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        return {
+            "frames": self.frames,
+            "network_size": list(self.predictor.size),
+            "depth": dict(self.scales),
+            "fps": self.fps,
+            "fps_of_predicting": self.frames / self.predict_s,  # without reading and writing
+        }
+
+
+# --- images and videos ----------------------------------------------------------------------------
+
+
+def predict_images(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, Any]:
+    """Predict images one by one and write their files; returns what to record of them.
+
+    Raises:
+        ValueError: a file that is no image, names that are there twice, impossible cameras.
+    """
+    images = []
+    for path, stem in zip(paths, stems_of(paths), strict=True):
+        image_HW3 = read_image(path)
+        camera = camera_of(path, (image_HW3.shape[0], image_HW3.shape[1]), job.given)
+        predicted = job.predict(stem, image_HW3, camera)
+        base = folder / stem
+        base.parent.mkdir(parents=True, exist_ok=True)
+        write_files(base, predicted, job.kinds, job.predictor.labels)
+        image = {"input": str(path), "name": stem, "size": list(image_HW3.shape[:2])}
+        scale = {"unit": predicted.unit, "scale_from": predicted.scale_source}
+        images.append({**image, "camera": _camera(camera), **scale})
+        job.done(len(paths))
+    return {**job.record, "images": images}
+
+
+def predict_video(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, Any]:
+    """Predict the one video frame by frame into a video; returns what to record of it.
+
+    Raises:
+        ValueError: no video, no frame in it, an impossible camera, a full disk.
+    """
+    (path,) = paths
+    reader = Reader(path)
+    camera = camera_of(path, reader.size, job.given)
+    labels = job.predictor.labels
+    video = folder / f"{path.stem}.mp4"
+    with Writer(video, reader.fps) as writer:
+        for number, image_HW3 in enumerate(reader):
+            stem = f"{path.stem}_{number:06d}"
+            predicted = job.predict(stem, image_HW3, camera)
+            writer.write(video_frame(predicted, labels))
+            write_files(folder / stem, predicted, job.kinds, labels)
+            job.done(reader.frames)
+    about = {"input": str(path), "size": list(reader.size), "video_fps": reader.fps}
+    return {**job.record, **about, "camera": _camera(camera), "video": video.name}
+
+
+def is_video(paths: Sequence[Path]) -> bool:
+    """Whether the input is one file that is no image."""
+    return len(paths) == 1 and not is_image(paths[0])
+
+
+def _camera(camera: Mounted) -> dict[str, Any]:
+    fx, fy, cx, cy = camera.K_33[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "source": camera.source}
+    return {**values, "height_m": camera.height_m, "pitch_rad": camera.pitch_rad}
+
+
+def _scale_in_words(predicted: Predicted) -> str:
+    found = predicted.camera_height is not None
+    return f"{predicted.unit}, scale from {predicted.scale_source if found else 'nowhere'}"
+
+
+def summary(record: dict[str, Any], predictor: Predictor) -> list[str]:
+    """What a user should know of a run before trusting its depth."""
+    cameras = [image["camera"] for image in record.get("images", [record])]
+    sources = {camera["source"] for camera in cameras}
+    shown = sorted(sources, key=lambda source: (not source.startswith("guessed"), source))[:3]
+    lines = [f"intrinsics: {source}" for source in shown]
+    lines += [f"intrinsics of others: see {RECORD}"] * (len(sources) > len(shown))
+    lines += [f"depth in {scale}: {count} frames" for scale, count in record["depth"].items()]
+    size = record.get("images", [record])[0]["size"]
+    better = predictor.unsqueezed(size[0], size[1])
+    if better is not None:
+        rows, columns = predictor.size
+        lines.append(
+            f"note: {size[0]}x{size[1]} was squeezed to {rows}x{columns}; "
+            f"--size {better[0]}x{better[1]} would keep its shape"
+        )
+    return lines
+
+
+# --- in and out -----------------------------------------------------------------------------------
+
+
+def find(words: Sequence[str]) -> list[Path]:
+    """Files that images, folders (searched to their depths) and patterns mean, in that order.
+
+    Raises:
+        ValueError: nothing there.
+    """
+    found: list[Path] = []
+    for word in words:
+        path = Path(word)
+        if path.is_dir():
+            inside = sorted(p for p in path.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+            if not inside:
+                raise ValueError(f"{path}: no image in this folder ({', '.join(IMAGE_SUFFIXES)})")
+            found += inside
+        elif path.is_file():
+            found.append(path)
+        else:
+            matches = sorted(p for p in _matches(path) if p.is_file())
+            if not matches:
+                raise ValueError(f"no file, folder or pattern with files '{word}'")
+            found += matches
+    return found
+
+
+def _matches(pattern: Path) -> Iterator[Path]:
+    return Path(pattern.anchor).glob(str(pattern.relative_to(pattern.anchor)))
+
+
+@contextlib.contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """A temporary sibling, which takes the place of `out` unless something goes wrong.
+
+    Raises:
+        ValueError: `out` is there already, and not an empty folder.
+    """
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise ValueError(f"{out} exists and is not an empty folder: name a new one, or remove it")
+    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        partial.replace(out)  # on Linux an empty folder is replaced, too
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def stems_of(paths: Sequence[Path]) -> list[str]:
+    """Names of outputs: the inputs' below the folder that they have in common."""
+    parents = [path.resolve().parent for path in paths]
+    common = os.path.commonpath(parents)
+    stems = [
+        (parent / path.stem).relative_to(common).as_posix()
+        for path, parent in zip(paths, parents, strict=True)
+    ]
+    twice = [stem for stem, count in Counter(stems).items() if count > 1]
+    if twice:
+        raise ValueError(
+            f"{len(twice)} names are there twice, such as '{twice[0]}': run them apart"
+        )
+    return stems
+
+
+def write_record(folder: Path, record: dict[str, Any]) -> None:
+    text = json.dumps(record, indent=1)
+    (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+
+
+@contextlib.contextmanager
+def recorded(job: Job, path: Path | None) -> Iterator[None]:
+    """Log the job's frames into a Rerun file, which appears when all went well.
+
+    Raises:
+        ValueError: rerun-sdk is not installed.
+    """
+    if path is None:
+        yield
+        return
+    why = missing()
+    if why:
+        raise ValueError(why)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        job.recording = Recording(temporary, job.predictor.labels)
+        yield
+        job.recording.close()
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,222 @@
+"""The training loop, to be read from top to bottom."""
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from mtl_bench.core import plugins
+from mtl_bench.core.config import Cell, Optim
+from mtl_bench.core.device import Engine, initial_weights, seed_for
+from mtl_bench.core.method import Composed, LossMethod, Method
+from mtl_bench.core.terms import terms_of
+from mtl_bench.data.batch import Batch
+from mtl_bench.data.labels import LabelSet
+from mtl_bench.data.loader import open_dataset, train_batches
+from mtl_bench.model import Model, build_model
+from mtl_bench.tasks.losses import loss_terms
+from mtl_bench.train import checkpoint
+from mtl_bench.train.backward import Pass, Weighting, backward, losses_now
+from mtl_bench.train.curve import Curve
+from mtl_bench.train.gradients import stack_losses
+from mtl_bench.train.progress import Interrupted, Progress
+from mtl_bench.train.tracking import Tracker
+
+CHECKPOINT = "last.pt"
+
+
+def train(
+    cell: Cell,
+    labels: LabelSet,
+    root: Path,
+    run_dir: Path,
+    engine: Engine,
+    progress: Progress,
+    tracker: Tracker,
+    *,
+    start: Path | None = None,
+    sequence_labels: Path | None = None,
+) -> Model:
+    """Train a cell to its last step, from its own checkpoint where there is one.
+
+    Args:
+        root: the data set.
+        run_dir: where `last.pt` and `curve.csv` are kept.
+        start: checkpoint whose model and method a fresh run goes on from; optimiser and learning
+            rate begin anew.
+        sequence_labels: folder of labels of further frames to train on.
+
+    Raises:
+        FloatingPointError: a loss term is NaN or infinite.
+        Interrupted: a signal asked to stop; the state is saved.
+    """
+    optim = cell.recipe.optim
+    model, method, optimizer = build(cell, labels, engine)
+    torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
+    path, step = run_dir / CHECKPOINT, 0
+    if path.is_file():
+        state = checkpoint.read(path)
+        step = checkpoint.restore(state, model, method, optimizer, engine.scaler)
+        progress.say(f"continuing at step {step} of {optim.steps}")
+    elif start is not None:
+        checkpoint.restore_weights(checkpoint.read(start), model, method)
+
+    dataset = open_dataset(cell, "train", root, training=True, sequence_labels=sequence_labels)
+    loss = replace(cell.recipe.loss, automask=cell.recipe.loss.automask or dataset.needs_automask)
+    data_seed, first = seed_for(cell.seed, "data"), step * method.batches
+    workers = cell.recipe.data.workers
+    batches = train_batches(dataset, optim.batch, data_seed, first, workers, engine.pinned)
+    clipped: list[Tensor] = list(model.parameters())
+    model.train()
+
+    def save() -> None:
+        curve.flush()  # first: the rows up to a checkpoint's step must never be missing
+        checkpoint.save(path, step, model, method, optimizer, engine.scaler)
+
+    def forward(part: Batch) -> Pass:
+        with engine.autocast():
+            outputs = model.net(part.image_B3HW)
+            transforms = None
+            if model.pose is not None and part.context_BN3HW is not None:
+                transforms = model.pose(part.image_B3HW, part.context_BN3HW)
+        losses = loss_terms(part, outputs, transforms, loss, cell.tasks)
+        check_finite(losses, step)
+        return Pass(losses, outputs.representation)
+
+    with Curve(run_dir / "curve.csv", step) as curve:
+        while step < optim.steps:
+            step_start = time.perf_counter()
+            lr_factor = set_learning_rate(optimizer, optim, step)
+            drawn = [next(batches) for _ in range(method.batches)]
+            data_ms = 1000 * (time.perf_counter() - step_start)
+            parts = [
+                [partial(forward, part.to(engine.device, engine.channels_last)) for part in split]
+                for split in (batch.split(optim.micro_batch or optim.batch) for batch in drawn)
+            ]
+            optimizer.zero_grad(set_to_none=True)
+            weighting = backward(
+                method,
+                parts,
+                model,
+                scale=engine.scaler.get_scale(),
+                lr=optimizer.param_groups[0]["lr"],
+                cosines=bool(optim.cosine_every) and step % optim.cosine_every == 0,
+            )
+            update_norm = norm_of(model.shared_parameters()) / engine.scaler.get_scale()
+            grad_norm = engine.apply_gradients(optimizer, clipped, optim.clip)
+            if method.reevaluates:
+                after_K = stack_losses(method, losses_now(parts[0], model))
+                method.after_step(weighting.loss_K, after_K)
+            step += 1
+
+            row = describe_step(weighting, method, cell)
+            row |= {"update_norm": update_norm, "grad_norm": grad_norm, "lr_factor": lr_factor}
+            row["data_ms"] = data_ms  # the step's share that waited for its batches
+            row["step_ms"] = 1000 * (time.perf_counter() - step_start)
+            curve.append({"step": step, **row})
+            tracker.log({key: value for key, value in row.items() if value is not None}, step)
+            progress.update("train", step, optim.steps, f"loss {weighting.total:.3f}")
+            if step % optim.checkpoint_every == 0 or step == optim.steps or progress.stop_asked:
+                save()
+            if progress.stop_asked:
+                raise Interrupted(f"stopped at step {step} of {optim.steps}, saved in {path}")
+    return model
+
+
+def build(
+    cell: Cell, labels: LabelSet, engine: Engine
+) -> tuple[Model, Method, torch.optim.Optimizer]:
+    """Model, method and optimiser as they are before the first step."""
+    optim = cell.recipe.optim
+    if optim.batch < 2:
+        raise ValueError("optim.batch must be at least 2: batch statistics of 1x1 maps need two")
+    with initial_weights(cell.seed):
+        model = build_model(cell, labels)
+    method = build_method(cell)
+    engine.place(model)
+    method.to(engine.device)
+    heads = list(model.head_parameters())
+    in_heads = {id(parameter) for parameter in heads}
+    rest = [parameter for parameter in model.parameters() if id(parameter) not in in_heads]
+    decay = optim.weight_decay
+    groups = [
+        {"params": rest, "lr": optim.lr, "weight_decay": decay},
+        {"params": heads, "lr": optim.lr * optim.head_lr_factor, "weight_decay": decay},
+        {"params": list(method.parameters()), "lr": optim.method_lr, "weight_decay": 0.0},
+    ]
+    groups = [group for group in groups if group["params"]]
+    for group in groups:
+        group["initial_lr"] = group["lr"]
+    return model, method, torch.optim.Adam(groups, fused=True)
+
+
+def build_method(cell: Cell) -> Method:
+    """The cell's method over its losses; of `a+b`, the two composed.
+
+    Raises:
+        ValueError: two parts that are not a loss-value method and then a gradient method.
+    """
+    terms, seed = terms_of(cell.tasks, cell.granularity), seed_for(cell.seed, "method")
+    names = plugins.part_names(cell.method)
+    if len(names) == 1:
+        return plugins.load("methods", cell.method)(terms, seed=seed, **cell.method_args)
+    parts = [
+        plugins.load("methods", name)(terms, seed=seed, **cell.method_args.get(name, {}))
+        for name in names
+    ]
+    if [isinstance(part, LossMethod) for part in parts] != [True, False]:
+        raise ValueError(
+            f"method '{cell.method}' is not a loss-value method + a gradient method; "
+            f"mtl-bench list methods says which is which"
+        )
+    return Composed(*parts)
+
+
+def schedule(step: int, optim: Optim) -> float:
+    """Learning-rate factor: polynomial decay times a linear warm-up."""
+    warm = 1.0
+    if step < optim.warmup_steps:
+        warm = optim.warmup_factor + (1 - optim.warmup_factor) * step / optim.warmup_steps
+    return warm * (1 - step / optim.steps) ** optim.poly_power
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, optim: Optim, step: int) -> float:
+    factor = schedule(step, optim)
+    for group in optimizer.param_groups:
+        group["lr"] = group["initial_lr"] * factor
+    return factor
+
+
+def check_finite(losses: dict[str, Tensor], step: int) -> None:
+    for name, loss in losses.items():
+        if not torch.isfinite(loss):
+            raise FloatingPointError(
+                f"loss term '{name}' is {loss.item()} at step {step}: lower recipe.optim.lr, "
+                f"or set recipe.optim.clip, and look at the batch's data"
+            )
+
+
+def norm_of(parameters: Iterator[nn.Parameter]) -> float:
+    """Norm of their gradients together."""
+    grads = [parameter.grad for parameter in parameters if parameter.grad is not None]
+    return torch.nn.utils.get_total_norm(grads).item()
+
+
+def describe_step(weighting: Weighting, method: Method, cell: Cell) -> dict[str, float | None]:
+    """What was minimised and how it was weighted; None for what this step does not have."""
+    row: dict[str, float | None] = {"total": weighting.total}
+    for term in terms_of(cell.tasks):
+        row[f"loss.{term.name}"] = weighting.losses.get(term.name)
+    names = [term.name for term in method.terms]
+    for name in names:
+        row[f"weight.{name}"] = weighting.weights.get(name)
+    row["weight_sum"] = sum(weighting.weights.values())
+    if cell.recipe.optim.cosine_every:
+        for first, second in itertools.combinations(names, 2):
+            row[f"cosine.{first}.{second}"] = weighting.cosines.get(f"{first}.{second}")
+    return row
