@@ -31,16 +31,9 @@ HARNESS = "harness"
 # stand in the cell's id.
 EXCLUDED = {
     *("core.config", "core.recipe", "core.plain", "core.plugins", "core.provenance"),
-    *(
-        "core.fingerprint",
-        "core.columns",
-        "core.quality",
-        "core.files",
-        "core.locks",
-        "train.progress",
-        "train.tracking",
-    ),
-    *("train.curve", "bench.jobs", "bench.store", "cli", "report", "show"),
+    *("core.fingerprint", "core.columns", "core.quality", "core.files", "core.locks"),
+    *("train.progress", "train.tracking", "train.curve"),
+    *("bench.jobs", "bench.store", "cli", "report", "show"),
 }
 MEMBERS = "stage_members"
 SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
