@@ -156,17 +156,21 @@ def test_nothing_heavy_is_imported(words, tmp_path):
     subprocess.run([sys.executable, "-c", PROBE, *words.split()], check=True, cwd=tmp_path)
 
 
-def test_help_takes_less_than_a_third_of_a_second():
-    """Of the processor's time: the machine may be busy."""
-    command = [sys.executable, "-m", "mtl_bench", "--help"]
-    best = float("inf")
+def processor_s(*words):
+    """Of the best of three runs: the machine may be busy."""
+    taken = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run(command, check=True, capture_output=True, env=os.environ)
+        subprocess.run([sys.executable, *words], check=True, capture_output=True, env=os.environ)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        took = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        best = min(best, took)
-    assert best < 0.45  # 0.3 on an idle machine
+        taken.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(taken)
+
+
+def test_help_takes_little_more_than_the_library_that_draws_it():
+    """0.3 s where that takes 0.2 s; as a ratio, since machines differ and slow down."""
+    library = processor_s("-c", "import typer.rich_utils, rich.markdown")
+    assert processor_s("-m", "mtl_bench", "--help") < 2 * library
 
 
 @pytest.mark.parametrize(
