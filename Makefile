@@ -8,8 +8,8 @@ BIN := $(VENV)/bin
 ablate: $(VENV)/installed
 	$(BIN)/mtl-bench ablate --grid backbones
 
-test: lint
-	$(BIN)/python -m pytest
+test: lint  # one file of tests a core; more threads than cores would wait for each other
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

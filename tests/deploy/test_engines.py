@@ -4,7 +4,8 @@ import importlib.util
 import itertools
 import math
 import re
-from pathlib import Path
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ import torch.nn.functional as F
 from small_networks import SIZE, images, model, subject
 from torch import Tensor, nn
 
+from mtl_bench.bench import stored
 from mtl_bench.core.engine import Setting
 from mtl_bench.core.recipe import Recipe
+from mtl_bench.data import scenes as synthetic
 from mtl_bench.deploy import agreement, engines, roofline, timer
+from mtl_bench.deploy import subject as subjects
 from mtl_bench.deploy.graph import NORM, Body, Upsample, fold, strided
 from mtl_bench.deploy.maps import Maps, infos
 
@@ -394,21 +398,23 @@ def test_work_of_a_network_is_that_of_its_convolutions(monkeypatch):
     assert roofline.share({"gmacs": 0.1, "network_mb": 20}, 100, 1, 40) == pytest.approx(0.5)
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A network that has learned something: a quarter of the built-in recipe."""
+    runs = tmp_path_factory.mktemp("runs")
+    words = ["train", "--backbone", "resnet18", "--set", "recipe.optim.steps=300", "--runs", runs]
+    subprocess.run([sys.executable, "-m", "mtl_bench", *map(str, words)], check=True)
+    (path,) = runs.glob("*/last.pt")
+    return path
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
-def test_trained_weights_over_the_val_split(name):
+def test_trained_weights_over_the_val_split(name, trained):
     """Acceptance: 20 frames of the built-in val split, at the size that the network learned."""
-    found = sorted(Path("runs").glob("*/last.pt"))
-    if not found:
-        pytest.skip("no trained run in runs/")
-    from mtl_bench.bench import stored
-    from mtl_bench.data import scenes as synthetic
-    from mtl_bench.deploy import subject as subjects
-
-    cell, trained = stored.deployed(found[0], None)
-    what = subjects.subject(
-        cell, trained, SIZE, synthetic.ensure(cell.recipe.data), CPU, True, images=20
-    )
+    cell, weights = stored.deployed(trained, None)
+    root = synthetic.ensure(cell.recipe.data)
+    what = subjects.subject(cell, weights, SIZE, root, CPU, True, images=20)
     with torch.inference_mode():
         result = timer.compare(what, timer.make(what, name, setting()), 20)
     assert result.wrong("fp32") == ""

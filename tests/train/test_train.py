@@ -83,11 +83,14 @@ train(cell, root, run_dir, Compute(torch.device("cpu")), Dies(run_dir, print),
 """
 
 
+OTHERS = ("fixed", "uncertainty", "famo", "auto_lambda", "fixed_uncertainty+pcgrad")
+
+
 @pytest.mark.parametrize(
     "method",
     [
-        *("fixed", "uncertainty", "fixed_uncertainty", "famo"),  # famo looks again after the step
-        *("modo", "auto_lambda", "fixed_uncertainty+pcgrad"),  # 3 batches a step, 2, and both kinds
+        *("fixed_uncertainty", "modo"),  # own parameters; three batches a step
+        *(pytest.param(method, marks=pytest.mark.slow) for method in OTHERS),
     ],
 )
 def test_killed_and_resumed_equals_straight_bit_for_bit(method, smoke_cell, smoke_root, tmp_path):
