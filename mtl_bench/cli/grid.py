@@ -45,9 +45,16 @@ def ablate(
         bool, typer.Option("--dry-run", help="Say what would run, and run nothing.")
     ] = False,
     jobs: Annotated[
-        int,
-        typer.Option("--jobs", metavar="N", min=1, help="Cells at a time; they share the cores."),
-    ] = 1,
+        int | None,
+        typer.Option(
+            "--jobs",
+            metavar="N",
+            min=1,
+            help="Cells at a time; they share the cores. Without it as many as there are cores, on "
+            "a GPU one.",
+            show_default=False,
+        ),
+    ] = None,
     rerun: Annotated[
         Rerun | None,
         typer.Option(
@@ -76,7 +83,7 @@ def ablate(
 
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
     chosen = choice.load(device)
-    if chosen.kind is not CELLS and jobs > 1:
+    if chosen.kind is not CELLS and (jobs or 1) > 1:
         raise ValueError(f"--jobs {jobs}: a latency is taken with nothing else of ours running")
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
@@ -91,6 +98,7 @@ def ablate(
         typer.echo("nothing was run (--dry-run)")
         return
     if todo:
+        jobs = jobs or _side_by_side(chosen, todo, device)
         _run(chosen, todo, runs, data, ["--wandb", wandb.value], device, jobs, rerun, quiet)
     if chosen.kind is CELLS:
         references.measure_trivial(
@@ -286,6 +294,17 @@ def _skipped(grid: "Grid") -> list[str]:
         return [f"  skipped: {skip.job.label}: {skip.why}" for skip in grid.skips]
     reasons = [skip.why for skip in grid.skips]
     return [f"  skipped {reasons.count(why)}: {why}" for why in dict.fromkeys(reasons)]
+
+
+def _side_by_side(grid: "Grid", todo: "Sequence[Job]", device: o.Device) -> int:
+    """A cell a core on the CPU, where two processes of one thread do more steps than one of two."""
+    from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.core.device import choose_device
+    from mtl_bench.core.provenance import cores
+
+    if grid.kind is not CELLS or choose_device(device.value).type != "cpu":
+        return 1
+    return min(cores(), sum(1 for job in todo if CELLS.work(job)) or 1)
 
 
 def _run(

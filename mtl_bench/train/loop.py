@@ -22,7 +22,7 @@ from mtl_bench.model import Model, build_model
 from mtl_bench.train import checkpoint
 from mtl_bench.train.backward import Pass, Weighting, backward, reevaluate
 from mtl_bench.train.curve import Curve
-from mtl_bench.train.progress import Interrupted, Progress
+from mtl_bench.train.progress import Interrupted, Pace, Progress
 from mtl_bench.train.tracking import Tracker
 
 CHECKPOINT = "last.pt"
@@ -85,6 +85,7 @@ def train(
         check_finite(losses, step)
         return Pass(losses, outputs.representation)
 
+    pace = Pace()
     with Curve(run_dir / "curve.csv", step) as curve:
         while step < optim.steps:
             step_start = time.perf_counter()
@@ -113,10 +114,12 @@ def train(
             row = describe_step(weighting, method, model.tasks, bool(optim.cosine_every))
             row |= {"update_norm": update_norm, "grad_norm": grad_norm, "lr_factor": lr_factor}
             row["data_ms"] = data_ms  # the step's share that waited for its batches
-            row["step_ms"] = 1000 * (time.perf_counter() - step_start)
+            row["step_ms"] = step_ms = 1000 * (time.perf_counter() - step_start)
             curve.append({"step": step, **row})
             tracker.log({key: value for key, value in row.items() if value is not None}, step)
             progress.update("train", step, optim.steps, f"loss {weighting.total:.3f}")
+            if slow := pace.note(step_ms, data_ms):
+                progress.say(slow)
             if step % optim.checkpoint_every == 0 or step == optim.steps or progress.stop_asked:
                 save()
             if progress.stop_asked:

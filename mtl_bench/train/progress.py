@@ -1,14 +1,21 @@
 """What a running cell tells the outside: one small JSON file, and a signal asking it to stop."""
 
 import json
+import os
 import signal
+import statistics
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
 from mtl_bench.core.files import replacing
 from mtl_bench.core.locks import Quiet
+from mtl_bench.core.provenance import cores
+
+WINDOW = 20  # steps whose median is their pace
+SLOW = 2.0  # times the first window's pace, of which the log tells
 
 
 class Interrupted(KeyboardInterrupt):
@@ -50,3 +57,35 @@ class Progress:
         state["seconds"] = round(now - self._start, 1)
         with replacing(self._path, synced=False) as file:
             file.write(json.dumps(state).encode())
+
+
+class Pace:
+    """Notices, once, that steps take far longer than the first ones, and tells why."""
+
+    def __init__(self) -> None:
+        self._first: list[float] = []
+        self._recent: deque[tuple[float, float]] = deque(maxlen=WINDOW)
+        self._told = False
+
+    def note(self, step_ms: float, data_ms: float) -> str | None:
+        """One line when the last steps' median is SLOW times that of the first ones."""
+        if len(self._first) < WINDOW:
+            self._first.append(step_ms)
+            return None
+        self._recent.append((step_ms, data_ms))
+        if self._told or len(self._recent) < WINDOW:
+            return None
+        first = statistics.median(self._first)
+        now = statistics.median(step for step, _ in self._recent)
+        if now < SLOW * first:
+            return None
+        self._told = True
+        waits = statistics.median(data / step for step, data in self._recent)
+        load = os.getloadavg()[0]
+        if waits > 0.5:
+            why = f"{100 * waits:.0f} % of it waits for data: raise recipe.data.workers"
+        elif load > cores() + 0.5:
+            why = f"other work shares the cores (load {load:.1f} on {cores()})"
+        else:
+            why = "the processor may have been slowed down"
+        return f"steps take {now / first:.1f} times as long as the first ones: {why}"
