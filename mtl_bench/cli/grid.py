@@ -298,13 +298,13 @@ def _skipped(grid: "Grid") -> list[str]:
 
 def _side_by_side(grid: "Grid", todo: "Sequence[Job]", device: o.Device) -> int:
     """A cell a core on the CPU, where two processes of one thread do more steps than one of two."""
-    from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.bench.jobs import CELLS, kind_of
     from mtl_bench.core.device import choose_device
     from mtl_bench.core.provenance import cores
 
     if grid.kind is not CELLS or choose_device(device.value).type != "cpu":
         return 1
-    return min(cores(), sum(1 for job in todo if CELLS.work(job)) or 1)
+    return min(cores(), sum(kind_of(job).work(job) > 0 for job in todo) or 1)
 
 
 def _run(
