@@ -13,6 +13,7 @@ Row = Mapping[str, Any]
 DELTA = (  # of a baseline whose own is 0
     Column("delta_flat", "delta.flat", "\u0394 flat", -1, 1, "% worse"),
     Column("delta_task", "delta.task", "\u0394 task", +1, 1, "% better", short=True),
+    Column("gain", "delta.gain", "log gain", +1, 1, "% better"),
 )
 COST = (
     FPS,
@@ -70,6 +71,7 @@ def figures() -> dict[str, str]:
     """Stems of the figures that a grid's report may have -> their headings, in the page's order."""
     return {
         **{f"{y.name}_{x.name}": against(y, x) for y, x in pairs()},
+        "forest": "Against the control",
         "samples": "Sample predictions",
         "extremes": "Worst and best frame of each row",
         **{stem: capital(f"{c.in_words} per class") for stem, c in per_class().items()},

@@ -9,7 +9,7 @@ from typing import Any
 
 from mtl_bench.core import quality
 from mtl_bench.core.columns import Column
-from mtl_bench.evaluate.delta import delta_flat, delta_task
+from mtl_bench.evaluate.delta import delta_flat, delta_task, log_gain
 from mtl_bench.report.columns import Row
 
 
@@ -27,7 +27,7 @@ def counted(rows: Sequence[Row]) -> list[Column]:
 def with_delta(
     rows: Sequence[Row], baseline_of: Callable[[Row], Row | None]
 ) -> list[dict[str, Any]]:
-    """Copies of rows with `delta.flat` and `delta.task` among their metrics, in percent.
+    """Copies of rows with `delta.flat`, `.task` and `.gain` among their metrics, in percent.
 
     A row has none where its baseline is missing or itself (0 by definition, no finding), where one
     of the two lacks a metric, where the baseline has a 0 (no change relative to it exists), and
@@ -42,10 +42,14 @@ def _with_delta(row: Row, baseline: Row | None, metrics: Sequence[Column]) -> di
         return dict(row)
     own, base = row["metric"], baseline["metric"]
     upward = {column.key: column.better > 0 for column in metrics}
+    task_of = {column.key: column.task for column in metrics}
     delta = {
         "delta.flat": delta_flat(own, base, upward),
-        "delta.task": delta_task(own, base, upward, {c.key: c.task for c in metrics}),
+        "delta.task": delta_task(own, base, upward, task_of),
     }
+    if all(own[key] >= 0 and base[key] > 0 for key in upward):  # else there are no ratios
+        points = log_gain(own, base, upward, task_of)
+        delta["delta.gain"] = 100 * math.expm1(points / 100)
     return {**row, "metric": {**own, **delta}, "delta_baseline": _named(baseline)}
 
 

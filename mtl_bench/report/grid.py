@@ -45,6 +45,7 @@ from mtl_bench.report.table import (
     single,
     write,
 )
+from mtl_bench.report.verdicts import forest, judge, notes, section
 
 PUBLISHED = Path(__file__).parent / "literature.toml"
 AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
@@ -65,6 +66,7 @@ class Layout:
     first: tuple[str, ...] = ()  # columns that stand before the others
     only: str | None = None  # "cost": step time and memory alone, without figures
     reference: str | None = None  # the line (value of `rows`) that these two are relative to, too
+    control: str | None = None  # the line that every other is tested against
     readme: tuple[str, ...] | None = None  # figures beside the table in a README; None: over speed
 
     def __post_init__(self) -> None:
@@ -346,8 +348,9 @@ def _delta(results: Results) -> str:
         f"Delta: over {named}, relative to the baseline ({against}) of the same seed. "
         f"Flat: mean relative loss over the {_count(metrics)} metrics, so that "
         "less is better and a negative one is a gain. Task: mean relative gain, first over a "
-        f"task's metrics and then over the {_count(tasks)} tasks, so that more is better. The "
-        "baseline's own is 0 by definition and not shown; bold is ahead of it, too."
+        f"task's metrics and then over the {_count(tasks)} tasks, so that more is better. "
+        "Log gain: likewise, of the ratios' logarithms, so that a halved and a doubled error weigh "
+        "the same. The baseline's own is 0 by definition and not shown; bold is ahead of it, too."
     )
 
 
@@ -410,6 +413,13 @@ def build(
     captions = {} if layout.only else _draw(results, out_dir, runs_root)
     wide = known.figures() if len(results.groups) > MANY else WIDE
     table = fill(results)
+    if layout.control is not None and (judged := judge(rows, layout.rows, layout.control)):
+        captions["forest"] = forest(judged, out_dir, "forest")
+        table = replace(
+            table,
+            sections=(*table.sections, section(judged)),
+            notes=(*table.notes, *notes(judged)),
+        )
     page = Page(
         kind="grid",
         title=f"{grid.name}: mtl-bench report",
