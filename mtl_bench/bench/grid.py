@@ -29,6 +29,7 @@
 
     [report]                        # read by mtl_bench/report
     rows = "name"                   # or an axis
+    control = "Halved"              # the line that every other is tested against
 
 `method` and `backbone` stand in the axes or in every row; a file without [[row]] is the axes alone.
 Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, recipe,
