@@ -77,24 +77,27 @@ def test_fewer_seeds_are_marked(built, name):
     assert "Fewer seeds than another line" in text
 
 
-def test_equal_seeds_have_no_mark(tmp_path):
-    report.build(GRID, grid_rows(), tmp_path)
-    assert "\u2020" not in (tmp_path / "table.md").read_text(encoding="utf-8")
+def test_equal_seeds_have_no_mark():
+    assert "\u2020" not in table.markdown(report.fill(report.tabulate(grid_rows())))
 
 
 def test_a_failed_report_leaves_the_old_one(tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    report.build(GRID, grid_rows(), out)
-    (out / "mine.txt").write_text("kept")
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    grid = type(GRID)(**{**vars(GRID), "report": {"only": "cost"}})  # which has no figures
+    report.build(grid, grid_rows(), tmp_path)
+    (tmp_path / "pq_fps.png").write_bytes(b"drawn before")
+    (tmp_path / "mine.txt").write_text("kept")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(report, "render", full)
-    with pytest.raises(OSError, match="No space"):
-        report.build(GRID, grid_rows()[:3], out)
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    with monkeypatch.context() as patched:
+        patched.setattr(report, "render", full)
+        with pytest.raises(OSError, match="No space"):
+            report.build(grid, grid_rows()[:3], tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    report.build(grid, grid_rows()[:3], tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {*before} - {"pq_fps.png"}
 
 
 def test_missing_letters_are_told_in_one_line(tmp_path, capsys):
