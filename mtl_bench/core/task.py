@@ -138,6 +138,9 @@ class Task:
     columns: ClassVar[tuple[Column, ...]] = ()  # of its metrics
     maps: ClassVar[Mapping[str, MapInfo]] = {}  # that `finish` reads, by the head's names
     exported: ClassVar[tuple[str, ...]] = ()  # results that an exported file gives
+    # Of those, of its maps and of "points" in such a file: what they are, their unit, and what
+    # stands where there is no value
+    meaning: ClassVar[Mapping[str, str]] = {}
     has_points: ClassVar[bool] = False  # whether `points` gives any
     reads_camera: ClassVar[bool] = False  # whether `finish` or `points` does
     makes_labels: ClassVar[bool] = False  # whether the video stage's labels come from it
@@ -190,6 +193,7 @@ class Task:
             "trivial",
             "write_results",
             "exported",
+            "meaning",
             "reads_camera",
             "has_points",
             "like_trained",

@@ -72,7 +72,16 @@ class Depth(Task):
     after = ("panoptic",)  # the ground, which the scale is taken from
     averages_flip = True
     maps: ClassVar[Mapping[str, MapInfo]] = {"inverse": MapInfo("inverse_depth", quantity="depth")}
-    exported = ("depth_m",)
+    exported = ("depth_m", "depth", "scale")
+    meaning: ClassVar[Mapping[str, str]] = {
+        "inverse_depth": "1 / depth along the optical axis, without scale",
+        "depth_m": "along the optical axis in the unit of camera_height_m: scale * depth; NaN "
+        "everywhere where no ground was found. Classes without a surface have values, too",
+        "depth": "along the optical axis, without scale: what is left where no ground was found",
+        "scale": "from depth to depth_m, from the camera's height above the ground; NaN: no ground",
+        "points": "in the camera's frame: x right, y down, z forward, in the unit of "
+        "camera_height_m; NaN where no ground was found or the class has no surface",
+    }
     has_points = True
     reads_camera = True
     columns = (

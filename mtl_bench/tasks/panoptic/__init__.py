@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.columns import Column
 from mtl_bench.core.dataset import LabelFrames
-from mtl_bench.core.labels import IGNORE, LabelSet, class_of_instance_id
+from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet, class_of_instance_id
 from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
@@ -74,6 +74,13 @@ class Panoptic(Task):
         "offset": MapInfo("offset"),
     }
     exported = ("panoptic",)
+    meaning: ClassVar[Mapping[str, str]] = {
+        "semantic": "class index",
+        "center": "heat of instances' centers, in [0, 1], not thresholded",
+        "offset": "(y, x) from each pixel to its instance's center, pixels",
+        "panoptic": f"class index * {DIVISOR} + instance from 1; instance 0: stuff, or a thing in "
+        f"an image without any center; {grouping.VOID}: no segment",
+    }
     makes_labels = True
     columns = (
         Column(
