@@ -148,6 +148,8 @@ class Task:
     # The kinds of files that `predict` can write of a frame, the picture first; "points" is the
     # cloud that is made of a Surface
     files: ClassVar[tuple[str, ...]] = ()
+    # Endings of files that `read_result` reads, the most telling first
+    scored: ClassVar[tuple[str, ...]] = ()
     # Maps that `Metric.update` gives and reports draw beside "true_<name>": the captions' words
     drawn: ClassVar[Mapping[str, str]] = {}
     agreement: ClassVar[tuple[Column, ...]] = ()  # of how near an engine's results are
@@ -200,6 +202,8 @@ class Task:
             "at_size",
             "view",
             "files",
+            "scored",
+            "read_result",
             "drawn",
             "drawn_view",
             "agreement",
@@ -323,6 +327,17 @@ class Task:
     ) -> Path | None:
         """Results of named frames as files of an official evaluator; None where there is none."""
         return None
+
+    def read_result(self, path: Path, size: Size) -> Results:
+        """What the metrics read of one frame, from a file that may have been made elsewhere.
+
+        Args:
+            size: of the truth.
+
+        Raises:
+            ValueError: a file that does not fit.
+        """
+        raise NotImplementedError
 
     def trivial(self, size: Size) -> Trivial | None:
         """The trivial predictor for frames of this size, where there is one."""
