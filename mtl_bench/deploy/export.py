@@ -216,7 +216,7 @@ def write(
             opset_version=OPSET,
             input_names=list(inputs),
             output_names=list(outputs),
-            dynamic_shapes=multiple and (free(multiple, 1, 2),),
+            dynamic_shapes=None if multiple is None else (free(multiple, 1, 2),),
             verbose=False,
         )
     assert program is not None
