@@ -149,12 +149,16 @@ def export(
             help="Post-processing in the same graph, in a second file NAME.post.onnx, or nowhere.",
         ),
     ] = "inside",
+    dynamic: Annotated[
+        bool,
+        typer.Option("--dynamic", help="Height and width are free; with --post none."),
+    ] = False,
     settings: o.SetOption = None,
     plugins: o.PluginsOption = None,
 ) -> None:
-    """Write a network as ONNX of a fixed size: 8-bit image in, panoptic ids, depth and points out.
+    """Write a network as ONNX: 8-bit image in, panoptic ids, depth and points out.
 
-    The inputs' and outputs' names are printed; classes, size and cell id are in the metadata.
+    The inputs' and outputs' names are printed; NAME.json beside it says what each of them is.
     """
     cell, model = _network(checkpoint, backbone, recipe, tasks, settings)
     from mtl_bench.deploy import export as exporter
@@ -162,14 +166,13 @@ def export(
 
     check_size(cell, o.size(size))
     origin = {} if checkpoint is None else {"cell_id": cell.id, "cell": cell.slug}
-    paths = exporter.export(model.net.eval(), o.size(size), out, post, origin)
-    import onnx
-
+    multiple = cell.recipe.network.strides[-1] if dynamic else None
+    paths = exporter.export(model.net.eval(), o.size(size), out, post, origin, multiple)
     for path in paths:
-        graph = onnx.load(str(path)).graph
         typer.echo(f"{path}  {path.stat().st_size / 1e6:.1f} MB")
-        typer.echo(f"  inputs   {', '.join(value.name for value in graph.input)}")
-        typer.echo(f"  outputs  {', '.join(value.name for value in graph.output)}")
+        for side, found in exporter.ports(path).items():
+            typer.echo(f"  {side:7}  {', '.join(found)}")
+    typer.echo(f"{out.with_suffix('.json')}  what each of them is")
 
 
 # --- steps ----------------------------------------------------------------------------------------

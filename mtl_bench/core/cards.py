@@ -10,9 +10,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import quote
 
 from mtl_bench.core import plugins
 from mtl_bench.core.fingerprint import ancestry, forget_edited, load, of_package
+from mtl_bench.core.plain import in_markdown
 from mtl_bench.core.plugins import Description
 
 VENUE = re.compile(r"\b([A-Z][A-Za-z]+) ((?:19|20)\d\d)\b")
@@ -209,19 +211,29 @@ def page(found: Iterable[Card], folder: Path) -> str:
 
 
 def _table_row(card: Card, folder: Path) -> list[str]:
-    target = Path(os.path.relpath(card.about.path, folder)).as_posix()
+    target = quote(Path(os.path.relpath(card.about.path, folder)).as_posix())
     source = f"{card.venue} {card.year}".strip()
     cells = [source, card.needs, card.cost, _one_line(card)]
-    return [f"[{card.about.name}]({target})", *(cell.replace("|", r"\|") for cell in cells)]
+    return [f"[{in_markdown(card.about.name)}]({target})", *map(in_markdown, cells)]
 
 
 def _section(card: Card) -> str:
-    formula = f"```text\n{card.formula}\n```\n" if card.formula else ""
-    settings = ", ".join(f"`{key}={default}`" for key, default in card.settings.items())
+    fence = "`" * max(3, _longest_ticks(card.formula) + 1)
+    formula = f"{fence}text\n{card.formula}\n{fence}\n" if card.formula else ""
+    settings = ", ".join(_code(f"{key}={default}") for key, default in card.settings.items())
     notes = [f"Source: <{card.url}>." if card.url else ""]
     notes += [f"Needs {', '.join((card.needs, *card.extras))}." if card.needs else ""]
     notes += [f"Hyper-parameters: {settings}." if settings else ""]
-    return f"### {card.about.name}\n\n{formula}\n{' '.join(filter(None, notes))}\n"
+    return f"### {in_markdown(card.about.name)}\n\n{formula}\n{' '.join(filter(None, notes))}\n"
+
+
+def _code(text: str) -> str:
+    ticks = "`" * (_longest_ticks(text) + 1)
+    return f"{ticks}{text}{ticks}"
+
+
+def _longest_ticks(text: str) -> int:
+    return max(map(len, re.findall("`+", text)), default=0)
 
 
 def _one_line(card: Card) -> str:

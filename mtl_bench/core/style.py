@@ -5,6 +5,9 @@ and a line style of its own go with each, so that nothing hangs on colour alone.
 """
 
 import io
+import re
+import sys
+import warnings
 from collections.abc import Hashable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +25,8 @@ DASHES = ("-", "--", "-.", ":")
 T = TypeVar("T", bound=Hashable)
 BASELINE: dict[str, Any] = {"color": "#555555", "linestyle": (0, (1, 1.5)), "linewidth": 1.4}
 GRAY = "#666666"
+GLYPH = re.compile(r"Glyph (\d+) .* missing from")  # what matplotlib warns of, many times a figure
+told: set[str] = set()  # letters that the figures lack
 
 SETTINGS: dict[Any, Any] = {
     "svg.hashsalt": "mtl-bench",  # ids without randomness
@@ -39,6 +44,7 @@ SETTINGS: dict[Any, Any] = {
     "figure.dpi": 100,
     "savefig.dpi": 120,
     "path.simplify": True,
+    "text.parse_math": False,  # a name with two $ is a name
 }
 
 
@@ -64,10 +70,22 @@ def looks(labels: Iterable[T]) -> dict[T, Look]:
 
 @contextmanager
 def styled() -> Iterator[None]:
-    with mpl.rc_context():
+    with mpl.rc_context(), warnings.catch_warnings(record=True) as caught:
         mpl.rcdefaults()  # a user's matplotlibrc must not change a report
         mpl.rcParams.update(SETTINGS)
         yield
+    lacking = set()
+    for warning in caught:
+        if glyph := GLYPH.match(str(warning.message)):
+            lacking.add(chr(int(glyph[1])))
+        else:
+            warnings.warn_explicit(
+                warning.message, warning.category, warning.filename, warning.lineno
+            )
+    if lacking - told:
+        font, letters = SETTINGS["font.family"], " ".join(sorted(lacking - told))
+        print(f"PNG files show boxes for letters that {font} lacks: {letters}", file=sys.stderr)
+    told.update(lacking)
 
 
 def save(figure: Figure, out_dir: Path, name: str, pixels: bool = False) -> None:

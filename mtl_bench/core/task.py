@@ -138,6 +138,9 @@ class Task:
     columns: ClassVar[tuple[Column, ...]] = ()  # of its metrics
     maps: ClassVar[Mapping[str, MapInfo]] = {}  # that `finish` reads, by the head's names
     exported: ClassVar[tuple[str, ...]] = ()  # results that an exported file gives
+    # Of those, of its maps and of "points" in such a file: what they are, their unit, and what
+    # stands where there is no value
+    meaning: ClassVar[Mapping[str, str]] = {}
     has_points: ClassVar[bool] = False  # whether `points` gives any
     reads_camera: ClassVar[bool] = False  # whether `finish` or `points` does
     makes_labels: ClassVar[bool] = False  # whether the video stage's labels come from it
@@ -145,6 +148,8 @@ class Task:
     # The kinds of files that `predict` can write of a frame, the picture first; "points" is the
     # cloud that is made of a Surface
     files: ClassVar[tuple[str, ...]] = ()
+    # Endings of files that `read_result` reads, the most telling first
+    scored: ClassVar[tuple[str, ...]] = ()
     # Maps that `Metric.update` gives and reports draw beside "true_<name>": the captions' words
     drawn: ClassVar[Mapping[str, str]] = {}
     agreement: ClassVar[tuple[Column, ...]] = ()  # of how near an engine's results are
@@ -190,12 +195,15 @@ class Task:
             "trivial",
             "write_results",
             "exported",
+            "meaning",
             "reads_camera",
             "has_points",
             "like_trained",
             "at_size",
             "view",
             "files",
+            "scored",
+            "read_result",
             "drawn",
             "drawn_view",
             "agreement",
@@ -319,6 +327,17 @@ class Task:
     ) -> Path | None:
         """Results of named frames as files of an official evaluator; None where there is none."""
         return None
+
+    def read_result(self, path: Path, size: Size) -> Results:
+        """What the metrics read of one frame, from a file that may have been made elsewhere.
+
+        Args:
+            size: of the truth.
+
+        Raises:
+            ValueError: a file that does not fit.
+        """
+        raise NotImplementedError
 
     def trivial(self, size: Size) -> Trivial | None:
         """The trivial predictor for frames of this size, where there is one."""

@@ -16,6 +16,7 @@ from mtl_bench.core.canvas import Image, LogScale
 from mtl_bench.core.labels import LabelSet
 
 METRES = "m"
+STEPS = 256
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,11 @@ class Surface(View):
     unit: str
     source: str = ""  # of its scale, in a word
     camera_height: float | None = None  # above the ground, in `unit`; None without a scale
+
+    @property
+    def steps(self) -> int:
+        """Of a unit in a file of 16-bit pixels; 256 as KITTI has them."""
+        return STEPS
 
     def scale(self, depth: NDArray[np.floating[Any]]) -> LogScale:
         """Colours of such depths."""

@@ -1,20 +1,11 @@
-"""A model as ONNX files of a fixed size, for whoever runs it without this package.
+"""A model as ONNX files, for whoever runs it without this package.
 
-Inputs: `image` uint8 [1,H,W,3], RGB. With depth and the post-processing inside also `K` [1,3,3]
-(intrinsics in pixels of that image), `camera_height_m` [1] and `pitch_rad` [1] (to the ground,
-positive looks down).
-
-Outputs, post-processing `inside`: see the tasks.
-    panoptic   int32 [1,H,W]: class index * 1000 + instance; -1 = void
-    depth_m    [1,1,H,W]
-    points     [1,3,H,W], metres in the camera's frame: x right, y down, z forward
-Outputs without it, as MGNet's exported graph has them (but for center, which is not thresholded):
-    semantic   int32 [1,H,W], class index
-    center     [1,1,H,W], in [0, 1]
-    offset     [1,2,H,W]: (y, x) to the instance's center, pixels
-    inverse_depth  [1,1,H,W], unscaled
-`apart`: those, and a second file NAME.post.onnx from them (and K, ...) to the three above. What
-belongs to a task that the model lacks is absent. Metadata: classes, things, size, layout, cell id.
+Inputs: `image` uint8 [1,H,W,3], RGB, and with post-processing what tasks read of the camera.
+Outputs with post-processing `inside` are the tasks' results, without it (`none`) their maps at the
+image's size, of classes the index; `apart` makes two files, NAME.post.onnx from the first one's
+maps. NAME.json beside them says of every input and output its type, axes, unit, and what stands
+where there is no value, and which class has which index. Metadata of each file: classes, things,
+size, layout, cell id.
 """
 
 import contextlib
@@ -22,8 +13,9 @@ import json
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -31,11 +23,11 @@ from torch import Tensor, nn
 
 from mtl_bench import __version__
 from mtl_bench.core.engine import Setting
-from mtl_bench.core.files import write_bytes
+from mtl_bench.core.files import write_bytes, write_json
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.task import Task
 from mtl_bench.deploy import maps
-from mtl_bench.deploy.graph import Strided, strided
+from mtl_bench.deploy.graph import Strided, free, strided
 
 POST = ("inside", "apart", "none")
 OPSET = 20
@@ -44,13 +36,14 @@ OPSET = 20
 class FullSize(nn.Module):
     """The strided graph, and its maps at the image's size; of classes only their index."""
 
-    def __init__(self, strided: Strided, size: tuple[int, int]):
+    def __init__(self, strided: Strided, size: tuple[int, int] | None):
         super().__init__()
         self.strided, self.size = strided, size  # `graph` is a name that torch.fx uses
 
     def forward(self, image_1HW3: Tensor) -> tuple[Tensor, ...]:
+        size = self.size or image_1HW3.shape[1:3]
         found = [
-            F.interpolate(x, self.size, mode="bilinear", align_corners=True)
+            F.interpolate(x, size, mode="bilinear", align_corners=True)
             for x in self.strided(image_1HW3)
         ]
         infos = maps.infos(self.strided.tasks).values()
@@ -91,39 +84,87 @@ def export(
     path: Path,
     post: str = "inside",
     metadata: dict[str, str] | None = None,
+    multiple: int | None = None,
 ) -> list[Path]:
-    """Write the file or, with `apart`, both; their paths.
+    """Write the file or, with `apart`, both, and the JSON file that describes them; their paths.
 
     Args:
         net: a model's `net` in evaluation mode.
         size: H, W.
         metadata: joins what the files say of themselves.
+        multiple: height and width are free, in multiples of this; without post-processing, whose
+            lengths and areas are made for one size.
 
     Raises:
-        ValueError: no such `post`, or the package onnx is missing.
+        ValueError: no such `post`, the package onnx is missing, or a size cannot be free.
     """
     if post not in POST:
         raise ValueError(f"--post '{post}' is none of {', '.join(POST)}")
-    graph = strided(net, (1, *size))
-    full = FullSize(graph, size)
+    if path.suffix == ".json":
+        raise ValueError(f"--out '{path}' is the name of the file that describes it: name an .onnx")
+    if multiple is not None and post != "none":
+        raise ValueError(
+            "--dynamic goes with --post none: the post-processing is made for one size, in pixels"
+        )
+    graph = strided(net, (1, *size), multiple=multiple)
+    full = FullSize(graph, size if multiple is None else None)
     tasks = graph.tasks
     names = [about.exported for about in maps.infos(tasks).values()]
     camera = maps.camera_of(tasks, size)
     finish, results = Post(tasks), maps.results_of(tasks)
     image = {"image": torch.randint(0, 256, (1, *size, 3), dtype=torch.uint8)}
     about = _about(tasks[0].labels, size, post) | (metadata or {})
+    if multiple is not None:
+        about |= dict.fromkeys(("height", "width"), f"multiples of {multiple}")
     path.parent.mkdir(parents=True, exist_ok=True)
+    paths, second = [path], path.with_suffix(".post.onnx")
     if post == "inside":
         write(Whole(full, finish), image | camera, results, path, about)
-        return [path]
-    write(full, image, names, path, about)
-    if post == "none":
-        return [path]
-    with torch.no_grad():
-        found = dict(zip(names, full(image["image"]), strict=True))
-    second = path.with_suffix(".post.onnx")
-    write(finish, found | camera, results, second, about)
-    return [path, second]
+    else:
+        write(full, image, names, path, about, multiple)
+    if post == "apart":
+        with torch.no_grad():
+            found = dict(zip(names, full(image["image"]), strict=True))
+        write(finish, found | camera, results, second, about)
+        paths.append(second)
+    write_json(path.with_suffix(".json"), _described(paths, tasks, about))
+    return paths
+
+
+def ports(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
+    """Type and axes of a file's inputs and outputs, by name."""
+    import onnx
+
+    def of(values: Iterable[Any]) -> dict[str, dict[str, Any]]:
+        types = {value.name: value.type.tensor_type for value in values}
+        return {
+            name: {
+                "type": onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type).name,
+                "axes": [axis.dim_param or axis.dim_value for axis in kind.shape.dim],
+            }
+            for name, kind in types.items()
+        }
+
+    graph = onnx.load(str(path)).graph
+    return {"inputs": of(graph.input), "outputs": of(graph.output)}
+
+
+def _described(
+    paths: Iterable[Path], tasks: Sequence[Task], about: Mapping[str, str]
+) -> dict[str, Any]:
+    """What `NAME.json` holds."""
+    meaning = maps.meanings(tasks)
+    files = {path.name: ports(path) for path in paths}
+    for file in files.values():
+        for name, port in (*file["inputs"].items(), *file["outputs"].items()):
+            port["what"] = meaning.get(name, "")
+    labels = tasks[0].labels.labels
+    classes = [
+        {"index": index, "name": label.name, "label_id": label.label_id, "thing": label.is_thing}
+        for index, label in enumerate(labels)
+    ]
+    facts = {key: value for key, value in about.items() if key not in ("classes", "things")}
+    return {**facts, "files": files, "classes": classes}
 
 
 @contextlib.contextmanager
@@ -145,6 +186,7 @@ def write(
     outputs: Sequence[str],
     path: Path,
     metadata: Mapping[str, str] | None = None,
+    multiple: int | None = None,
 ) -> None:
     """Write a module as an ONNX file, which has its name once it is whole and sound.
 
@@ -152,6 +194,7 @@ def write(
         inputs: names and examples, in the order of the module's arguments.
         outputs: names, in the order of its results.
         metadata: goes into the file's metadata_props.
+        multiple: second and third axis of the one input are free, in multiples of this.
 
     Raises:
         ValueError: the package onnx is missing.
@@ -173,6 +216,7 @@ def write(
             opset_version=OPSET,
             input_names=list(inputs),
             output_names=list(outputs),
+            dynamic_shapes=None if multiple is None else (free(multiple, 1, 2),),
             verbose=False,
         )
     assert program is not None

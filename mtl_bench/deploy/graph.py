@@ -67,18 +67,26 @@ class Strided(nn.Module):
 
 
 def strided(
-    net: nn.Module, shape: tuple[int, int, int], dtype: torch.dtype = torch.float32
+    net: nn.Module,
+    shape: tuple[int, int, int],
+    dtype: torch.dtype = torch.float32,
+    multiple: int | None = None,
 ) -> Strided:
     """The graph of a network in evaluation mode, folded, channels last; the network stays as it is.
 
     Args:
         shape: B, H, W.
         dtype: of weights and activations; folding is done in float32 before.
+        multiple: H and W are free, in multiples of this.
+
+    Raises:
+        ValueError: a network that is made for one size, where H and W should be free.
     """
     body = Body(net)
     device = next(net.parameters()).device
     example_B3HW = torch.zeros(shape[0], 3, *shape[1:], device=device)
-    folded = fold(body, example_B3HW.contiguous(memory_format=torch.channels_last)).to(dtype)
+    example_B3HW = example_B3HW.contiguous(memory_format=torch.channels_last)
+    folded = fold(body, example_B3HW, multiple).to(dtype)
     graph = Strided(folded, net, dtype)
     for module in graph.modules():
         module.training = False  # an exported graph has no eval()
@@ -123,17 +131,43 @@ class GraphEngine(Engine):
 
 CONVOLUTIONS = (torch.ops.aten.conv2d.default, torch.ops.aten.conv2d.padding)
 NORM = torch.ops.aten.batch_norm.default
+LARGEST = 2**13  # pixels of a height or width that is free
 CHECK = torch.ops.aten._assert_tensor_metadata.default  # of dtypes, which engines change
 
 
-def fold(module: nn.Module, example: Tensor) -> fx.GraphModule:
+def free(multiple: int | None, height: int, width: int) -> dict[int, Any] | None:
+    """Axes of these numbers that are multiples of one number, for `torch.export`; None: fixed."""
+    if multiple is None:
+        return None
+    most = LARGEST // multiple
+    axes = {
+        height: torch.export.Dim("height", max=most),
+        width: torch.export.Dim("width", max=most),
+    }
+    return {axis: multiple * dim for axis, dim in axes.items()}
+
+
+def fold(module: nn.Module, example: Tensor, multiple: int | None = None) -> fx.GraphModule:
     """The module's graph for inputs of the example's size, with weights of its own.
 
     Args:
         module: in evaluation mode.
+        multiple: as in `strided`.
     """
     with torch.no_grad():
-        program = torch.export.export(copy.deepcopy(module), (example,), strict=False).module()
+        sizes = free(multiple, 2, 3)
+        try:
+            exported = torch.export.export(
+                copy.deepcopy(module), (example,), dynamic_shapes=sizes and (sizes,), strict=False
+            )
+        except Exception as error:
+            if multiple is None:
+                raise
+            why = str(error).strip().partition("\n")[0]
+            raise ValueError(
+                f"this network is made for one size: leave out --dynamic ({why})"
+            ) from error
+        program = exported.module()
         assert isinstance(program, fx.GraphModule)
         for check in program.graph.find_nodes(op="call_function", target=CHECK):
             program.graph.erase_node(check)

@@ -69,7 +69,12 @@ class Last:
 
 # --- in exported files ----------------------------------------------------------------------------
 
-CAMERA = ("K", "camera_height_m", "pitch_rad")  # names of a camera's parts
+CAMERA = {  # names of a camera's parts: what they are
+    "K": "intrinsics in pixels of the image; the center of its first pixel is (0, 0)",
+    "camera_height_m": "above the ground; metres make the results metres",
+    "pitch_rad": "of the camera to the ground, positive looks down",
+}
+IMAGE = {"image": "8-bit RGB, top row first"}
 
 
 def camera_of(tasks: Iterable[Task], size: tuple[int, int]) -> Maps:
@@ -92,6 +97,11 @@ def delivered(tasks: Sequence[Task], maps: Maps, camera: Sequence[Tensor]) -> li
         points = task.points(results, given)
         found += [] if points is None else [points]
     return found
+
+
+def meanings(tasks: Iterable[Task]) -> dict[str, str]:
+    """Of the inputs and outputs of exported files by name, as far as tasks say it."""
+    return IMAGE | CAMERA | {name: about for task in tasks for name, about in task.meaning.items()}
 
 
 def results_of(tasks: Iterable[Task]) -> list[str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from mtl_bench.core import quality
 from mtl_bench.core.columns import FPS, Column
+from mtl_bench.core.plain import in_a_line
 
 Row = Mapping[str, Any]
 
@@ -111,7 +112,7 @@ def text(value: Any) -> str:
         return ", ".join(text(item) for item in value) or "none"
     if isinstance(value, float):
         return f"{value:g}"
-    return "none" if value is None else str(value)
+    return "none" if value is None else in_a_line(str(value))
 
 
 def different(values: Iterable[Any]) -> list[str]:

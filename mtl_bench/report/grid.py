@@ -21,7 +21,7 @@ from mtl_bench.report import columns as known
 from mtl_bench.report import curves, pictures, plots, protocol
 from mtl_bench.report.columns import DELTA, ONLY, RELATIVE, Row, headlines, pairs, per_class, text
 from mtl_bench.report.delta import counted
-from mtl_bench.report.page import Page, figures_of, forget, render
+from mtl_bench.report.page import PAGE, Page, beside, figures_of, render
 from mtl_bench.report.statistics import (
     SHOWN,
     SMOKE,
@@ -34,7 +34,9 @@ from mtl_bench.report.statistics import (
 )
 from mtl_bench.report.table import (
     ARROWS,
+    FEWER,
     NOTHING,
+    WRAP,
     Cell,
     Head,
     Section,
@@ -130,6 +132,11 @@ class Results:
     def smoke(self) -> bool:
         return any(group.smoke for group in self.groups)
 
+    @property
+    def seeds(self) -> int:
+        """The most that a line has."""
+        return max((len(group.rows) for group in self.groups), default=0)
+
     def columns(self, part: str | None = None) -> list[Column]:
         """Those that some group has; of one part, where one is named."""
         return [
@@ -221,7 +228,7 @@ def fill(results: Results, short: bool = False) -> Table:
     banner = f"{SMOKE.capitalize()}." if results.smoke else ""
     said = {"Quality": f" {' '.join(notes)}"}
     lacking = [TableRow.of(c.label, c.status, c.reason, c.slug) for c in results.unfinished]
-    why = Head("why", left=True, css="wrap"), Head("folder", left=True, page_only=True)
+    why = Head("why", left=True, css=WRAP), Head("folder", left=True, page_only=True)
     heads = (*Head.words("cell", "status"), *why)
     return Table(
         sections=tuple(
@@ -230,7 +237,7 @@ def fill(results: Results, short: bool = False) -> Table:
         ),
         notes=notes,
         records=tuple(_records(results)),
-        lacking=(Section("Without numbers", heads, tuple(lacking)),) if lacking else (),
+        lacking=Section.lacking("Cells", heads, lacking),
         published=tuple(_published(source, results.axes[0]) for source in results.published),
         banner=banner,
     )
@@ -254,15 +261,17 @@ def _section(results: Results, heading: str, columns: Sequence[Column], caption:
     return Section(
         heading=heading,
         heads=(*Head.words(*map(axis_title, results.axes)), Head("n"), *map(Head.of, columns)),
-        lines=tuple(_line(group, columns) for group in shown),
+        lines=tuple(_line(group, columns, results.seeds) for group in shown),
         caption=caption.strip(),
     )
 
 
-def _line(group: Group, columns: Iterable[Column]) -> TableRow:
-    seeds = NOTHING if group.status == "trivial" else str(len(group.rows))
+def _line(group: Group, columns: Iterable[Column], most: int) -> TableRow:
+    count = len(group.rows)
+    fewer = FEWER * (count < most)
+    seeds = NOTHING if group.status == "trivial" else f"{count}{fewer}"
     name = Cell.marked(group.identity[0], group.mark)
-    values = [Cell.of(group.entries[c.name], c, len(group.rows)) for c in columns]
+    values = [Cell.of(group.entries[c.name], c, count) for c in columns]
     css = group.status + " smoke" * group.smoke
     return TableRow.of(name, *group.identity[1:], seeds, *values, css=css)
 
@@ -320,6 +329,8 @@ def footnotes(results: Results) -> Iterator[str]:
             "n = 1: one seed has no spread, so a lead by it or over it cannot be told from chance, "
             "and nothing is bold."
         )
+    if any(len(group.rows) < results.seeds for group in groups):
+        yield f"{FEWER} Fewer seeds than another line: mean and spread are not over the same."
     if any(0 < e.count < len(g.rows) for g in groups for e in g.entries.values()):
         yield "A number with its own n is the mean over those seeds that have the value."
     if DELTA[0] in results.columns():
@@ -408,9 +419,20 @@ def build(
     has_section = baseline is None or "metric" in baseline
     rows = [*rows, *_skipped(grid)]
     results = tabulate(rows, layout, baseline if has_section else {"metric": baseline})
-    out_dir.mkdir(parents=True, exist_ok=True)
-    forget(known.figures(), out_dir)
-    captions = {} if layout.only else _draw(results, out_dir, runs_root)
+    with beside(out_dir, known.figures()) as folder:
+        captions = {} if layout.only else _draw(results, folder, runs_root)
+        _write(grid, rows, results, captions, folder, command)
+    return out_dir / PAGE
+
+
+def _write(
+    grid: Any,
+    rows: Sequence[Row],
+    results: Results,
+    captions: dict[str, str | None],
+    folder: Path,
+    command: str,
+) -> None:
     wide = known.figures() if len(results.groups) > MANY else WIDE
     table = fill(results)
     if layout.control is not None and (judged := judge(rows, layout.rows, layout.control)):
@@ -442,9 +464,9 @@ def build(
     )
     more = {
         "readme.md": markdown(fill(results, short=True)),
-        "index.html": render(page, table, out_dir),
+        PAGE: render(page, table, folder),
     }
-    return write(table, out_dir, more)
+    write(table, folder, more)
 
 
 def _skipped(grid: Any) -> list[Row]:

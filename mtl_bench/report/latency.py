@@ -11,14 +11,16 @@ from typing import Any
 from markupsafe import Markup
 
 from mtl_bench.core.columns import FPS, Column
+from mtl_bench.core.plain import in_a_line
 from mtl_bench.core.quality import agreement, words
 from mtl_bench.report import latency_plots, protocol
 from mtl_bench.report.columns import Row, against, different, headlines, measured, text
 from mtl_bench.report.grid import published
-from mtl_bench.report.page import Page, figures_of, forget, render
+from mtl_bench.report.page import PAGE, Page, beside, figures_of, render
 from mtl_bench.report.statistics import SHOWN, SMOKE, entry_of
 from mtl_bench.report.table import (
     NOTHING,
+    WRAP,
     Cell,
     Head,
     Section,
@@ -194,7 +196,7 @@ def _line(row: Row, reference: Row | None) -> Line:
         size=f"{row['height']}x{row['width']}",
         names=(backbone, text(row["tasks"]), row["engine"], row["precision"]),
         status=row["status"],
-        why=str(row.get("why") or ""),
+        why=in_a_line(str(row.get("why") or "")),
         values=values,
     )
 
@@ -227,7 +229,7 @@ def fill(timings: Timings) -> Table:
     captions = [f"{banner} Latency at {size}." for size in timings.sizes]
     captions[0] += f" {' '.join(said)}"
     lacking = [TableRow.of(*cells) for cells in without_numbers(timings)]
-    heads = (*Head.words("status", "engine", "timings"), Head("why", left=True, css="wrap"))
+    heads = (*Head.words("status", "engine", "timings"), Head("why", left=True, css=WRAP))
     return Table(
         sections=tuple(
             _section(timings.of(size), timings.columns(), size, caption.strip())
@@ -235,7 +237,7 @@ def fill(timings: Timings) -> Table:
         ),
         notes=said,
         records=tuple(_records(timings)),
-        lacking=(Section("Without numbers", heads, tuple(lacking)),) if lacking else (),
+        lacking=Section.lacking("Timings", heads, lacking),
         published=tuple(_published(source) for source in published(AXIS, ())),
         banner=banner,
     )
@@ -428,14 +430,18 @@ def build(
         The page's path.
     """
     timings = tabulate(rows, quality)
-    out_dir.mkdir(parents=True, exist_ok=True)
-    forget(figures(), out_dir)
+    with beside(out_dir, figures()) as folder:
+        _write(grid, timings, folder, command)
+    return out_dir / PAGE
+
+
+def _write(grid: Any, timings: Timings, folder: Path, command: str) -> None:
     captions = {
-        f"{column.name}_{FPS.name}": latency_plots.against_quality(timings, column, out_dir)
+        f"{column.name}_{FPS.name}": latency_plots.against_quality(timings, column, folder)
         for column in headlines()
     }
-    captions["stages"] = latency_plots.stages(timings, out_dir)
-    captions["roofline"] = latency_plots.roofline(timings, out_dir)
+    captions["stages"] = latency_plots.stages(timings, folder)
+    captions["roofline"] = latency_plots.roofline(timings, folder)
     table = fill(timings)
     states = [line.status for line in timings.lines]
     counted = ", ".join(f"{states.count(s)} {s}" for s in dict.fromkeys(states))
@@ -457,9 +463,9 @@ def build(
     on_page = replace(table, notes=(*table.notes, *_left_out(grid)))
     more = {
         "readme.md": markdown(readme(timings)),
-        "index.html": render(page, on_page, out_dir),
+        PAGE: render(page, on_page, folder),
     }
-    return write(table, out_dir, more)
+    write(table, folder, more)
 
 
 def _left_out(grid: Any) -> list[str]:

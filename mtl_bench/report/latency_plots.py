@@ -109,6 +109,7 @@ def roofline(timings: "Timings", out_dir: Path) -> str | None:
                 axes.plot(*point, linestyle="", **_marker(timings, line))
             _roofs(axes, own, [x for x, _ in points])
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
             _plain_log(axes, "operations a byte")
         panels[0][0].set_ylabel("GFLOP/s of the network")
         _legend(figure, timings, lines, [])

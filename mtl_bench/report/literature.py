@@ -24,7 +24,7 @@ from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.config import load_recipe, recipe_names, to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
 from mtl_bench.report.columns import Row, flatten, measured, text
-from mtl_bench.report.page import Page, render
+from mtl_bench.report.page import PAGE, Page, beside, render
 from mtl_bench.report.statistics import (
     KNOWN,
     SHOWN,
@@ -504,9 +504,10 @@ def write(found: Comparison, out_dir: Path, command: str) -> Path:
         ),
         command=command,
     )
-    out_dir.mkdir(parents=True, exist_ok=True)
-    files = {
-        "table.tex": latex(fill(found, narrow=True)),
-        "index.html": render(page, table, out_dir),
-    }
-    return write_files(table, out_dir, files)
+    with beside(out_dir) as folder:
+        more = {
+            "table.tex": latex(fill(found, narrow=True)),
+            PAGE: render(page, table, folder),
+        }
+        write_files(table, folder, more)
+    return out_dir / PAGE

@@ -1,8 +1,10 @@
 """The page: table, figures and protocol in one HTML file that needs nothing but itself."""
 
 import base64
+import contextlib
 import re
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from mtl_bench.report.protocol import Protocol
 from mtl_bench.report.table import Section, Table, pretty
 
 TEMPLATE = "page.html.j2"
+PAGE = "index.html"
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,8 @@ class Page:
     folded: Section | None = None
 
 
-def render(page: Page, table: Table, out_dir: Path) -> str:
-    """The page's HTML; the figures' files are read from `out_dir`."""
+def render(page: Page, table: Table, folder: Path) -> str:
+    """The page's HTML; the figures' files are read from the folder."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -56,7 +59,7 @@ def render(page: Page, table: Table, out_dir: Path) -> str:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    drawn = [(figure, inline(out_dir, figure)) for figure in page.figures]
+    drawn = [(figure, inline(folder, figure)) for figure in page.figures]
     values: dict[str, Any] = {"page": page, "table": table, "figures": drawn, "pretty": pretty}
     return environment.get_template(TEMPLATE).render(values) + "\n"
 
@@ -67,19 +70,32 @@ def figures_of(headings: dict[str, str], captions: dict[str, str | None]) -> lis
     return [Figure(stem, heading, caption) for stem, heading, caption in drawn if caption]
 
 
-def forget(headings: dict[str, str], out_dir: Path) -> None:
-    """Delete what an earlier build drew."""
-    for stem in headings:
-        for suffix in ("png", "svg"):
-            (out_dir / f"{stem}.{suffix}").unlink(missing_ok=True)
+@contextlib.contextmanager
+def beside(out_dir: Path, figures: Iterable[str] = ()) -> Iterator[Path]:
+    """A folder to build in, whose files take their places in `out_dir` when the block ends.
+
+    If it fails, all there stays as it is.
+
+    Args:
+        figures: stems; those that an earlier build drew and this one did not go.
+    """
+    out_dir.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".new-", dir=out_dir) as folder:
+        built = Path(folder)
+        yield built
+        for name in (f"{stem}.{suffix}" for stem in figures for suffix in ("png", "svg")):
+            if not (built / name).exists():
+                (out_dir / name).unlink(missing_ok=True)
+        for path in sorted(built.iterdir()):
+            path.replace(out_dir / path.name)
 
 
-def inline(out_dir: Path, figure: Figure) -> Markup:
+def inline(folder: Path, figure: Figure) -> Markup:
     """The SVG itself, or the PNG as a data URI where there is no SVG."""
     alternative = escape(figure.caption)
-    svg = out_dir / f"{figure.name}.svg"
+    svg = folder / f"{figure.name}.svg"
     if not svg.is_file():
-        data = base64.b64encode((out_dir / f"{figure.name}.png").read_bytes()).decode()
+        data = base64.b64encode((folder / f"{figure.name}.png").read_bytes()).decode()
         return Markup(f'<img src="data:image/png;base64,{data}" alt="{alternative}">')
     drawing = svg.read_text(encoding="utf-8")
     drawing = drawing[drawing.index("<svg") :]

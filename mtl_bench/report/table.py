@@ -13,12 +13,15 @@ import pandas as pd
 from markupsafe import Markup
 
 from mtl_bench.core.columns import Column
+from mtl_bench.core.plain import in_a_line, in_markdown
 from mtl_bench.report.columns import Row, capital, measured
 from mtl_bench.report.statistics import Entry
 
 PLUS_MINUS = "\u00b1"
 ARROWS = {+1: "\u2191", -1: "\u2193"}
 NOTHING = "-"
+FEWER = "\u2020"  # behind the n of a line that has fewer seeds than another
+WRAP = "wrap"  # class of a column of sentences
 TEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},
     "\\": r"\textbackslash{}",
@@ -103,6 +106,17 @@ class Section:
     caption: str = ""  # in LaTeX; without one it does not stand there
     fit: bool = True  # LaTeX shrinks it to the width of the text
     units: bool = True  # LaTeX has them in a line of their own
+
+    @staticmethod
+    def lacking(
+        what: str, heads: tuple[Head, ...], lines: Sequence[TableRow]
+    ) -> "tuple[Section, ...]":
+        """What has no numbers, where there is any; the last column says why."""
+        caption = f"{what} without numbers."
+        made = Section(
+            "Without numbers", heads, tuple(lines), caption=caption, fit=False, units=False
+        )
+        return (made,) if lines else ()
 
     @staticmethod
     def published(
@@ -196,19 +210,11 @@ def numbers(
 # --- files ----------------------------------------------------------------------------------------
 
 
-def write(table: Table, out_dir: Path, more: Mapping[str, str]) -> Path:
-    """Write `table.{csv,md,tex}` and more files by name, each whole or not at all.
-
-    Returns:
-        The page's path.
-    """
-    out_dir.mkdir(parents=True, exist_ok=True)
+def write(table: Table, folder: Path, more: Mapping[str, str]) -> None:
+    """Write `table.{csv,md,tex}` and more files by name."""
     files = {"table.csv": csv(table), "table.md": markdown(table), "table.tex": latex(table)}
     for name, content in {**files, **more}.items():
-        temporary = out_dir / f".{name}.tmp"
-        temporary.write_text(content, encoding="utf-8", newline="\n")
-        temporary.replace(out_dir / name)
-    return out_dir / "index.html"
+        (folder / name).write_text(content, encoding="utf-8", newline="\n")
 
 
 def csv(table: Table) -> str:
@@ -220,7 +226,7 @@ def markdown(table: Table) -> str:
     """Its sections, what has no numbers, what others published, and the notes."""
     parts = [f"# {table.title}" if table.title else "", f"**{table.banner}**" * bool(table.banner)]
     for section in (*table.sections, *table.lacking, *table.published):
-        heading = f"**{section.heading}**" if section.heading else ""
+        heading = f"**{in_markdown(section.heading)}**" if section.heading else ""
         parts += [heading + section.remark, _pipes(section), section.source]
     parts.append(_bullets(table.notes))
     if table.sources:
@@ -230,12 +236,14 @@ def markdown(table: Table) -> str:
 
 def latex(table: Table) -> str:
     """Tables for a paper: `\\input` it where booktabs and graphicx are loaded."""
-    top = [r"% needs \usepackage{booktabs,graphicx}", *(f"% {source}" for source in table.sources)]
+    needs = r"% needs \usepackage{booktabs,graphicx}; UTF-8: beyond Latin letters LuaLaTeX"
+    top = [needs, *(f"% {in_a_line(source)}" for source in table.sources)]
     if table.joined:
         below = [f"$^{{{mark}}}$ {tex(meaning)}." for mark, meaning in table.letters.items()]
         below += map(tex, table.notes)
         return "\n".join([*top, _float(table.sections, f"{table.title}.", " ".join(below)), ""])
-    floats = [_float([s], s.caption) for s in (*table.sections, *table.published) if s.caption]
+    every = (*table.sections, *table.lacking, *table.published)
+    floats = [_float([section], section.caption) for section in every if section.caption]
     return "\n\n".join([*top, *floats]) + "\n"
 
 
@@ -244,33 +252,35 @@ def pretty(note: str) -> str:
 
 
 def tex(value: str) -> str:
-    """Text with LaTeX's special characters escaped, in ASCII."""
-    escaped = "".join(TEX.get(character, character) for character in value)
-    return escaped.replace("+-", r"$\pm$").encode("ascii", "replace").decode()
+    """Text in a line, LaTeX's special characters escaped; letters stay what they are."""
+    escaped = "".join(TEX.get(character, character) for character in in_a_line(value))
+    return escaped.replace("+-", r"$\pm$").replace("--", "-{}-")
 
 
 # --- parts ----------------------------------------------------------------------------------------
 
 
 def _bullets(lines: Iterable[str]) -> str:
-    return "\n".join(f"- {_starless(pretty(line))}" for line in lines)
+    return "\n".join(f"- {in_markdown(pretty(line))}" for line in lines)
 
 
-def _starless(value: str) -> str:
-    return value.replace("*", r"\*")
+def _in_files(section: Section) -> tuple[list[Head], list[list[Cell]]]:
+    """The columns that stand in more than the page, and their cells line by line."""
+    shown = [i for i, head in enumerate(section.heads) if not head.page_only]
+    lines = [[line.cells[i] for i in shown] for line in section.lines]
+    return [section.heads[i] for i in shown], lines
 
 
 def _pipes(section: Section) -> str:
-    shown = [i for i, head in enumerate(section.heads) if not head.page_only]
-    heads = [section.heads[i] for i in shown]
-    titles = [head.title + (f"<br>{head.about}" if head.about else "") for head in heads]
+    heads, lines = _in_files(section)
+    titles = ["<br>".join(map(in_markdown, filter(None, (h.title, h.about)))) for h in heads]
     rule = ["---" if head.left else "---:" for head in heads]
-    body = [[_in_markdown(line.cells[i]) for i in shown] for line in section.lines]
+    body = [map(_cell_in_markdown, cells) for cells in lines]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (titles, rule, *body))
 
 
-def _in_markdown(cell: Cell) -> str:
-    value = " ".join(filter(None, (_starless(cell.text).replace("|", r"\|"), cell.spread)))
+def _cell_in_markdown(cell: Cell) -> str:
+    value = " ".join(filter(None, (in_markdown(cell.text), cell.spread)))
     return f"**{value}**" if cell.bold else value
 
 
@@ -286,13 +296,19 @@ def _unit(about: str) -> str:
     return " ".join(f"${word}$" if "^" in word else tex(word) for word in about.split(" "))
 
 
+def _aligned(head: Head) -> str:
+    if head.css == WRAP:
+        return r"p{0.5\textwidth}"
+    return "l" if head.left else "r"
+
+
 def _float(sections: Sequence[Section], caption: str, below: str = "") -> str:
     """A LaTeX table; with something below, sections have their headings in it.
 
     Args:
         below: LaTeX that stands in small print below the caption.
     """
-    heads = sections[0].heads
+    heads, _ = _in_files(sections[0])
     rows = [[head.tex or tex(head.title) for head in heads]]
     rows += [[_unit(head.about) for head in heads]] * sections[0].units
     body: list[str] = []
@@ -300,9 +316,9 @@ def _float(sections: Sequence[Section], caption: str, below: str = "") -> str:
         if below:
             heading = rf"\multicolumn{{{len(heads)}}}{{l}}{{\emph{{{tex(section.heading)}}}}}"
             body.append((r"\midrule" if body else "") + heading)
-        body += [" & ".join(map(_in_latex, line.cells)) for line in section.lines]
+        body += [" & ".join(map(_in_latex, cells)) for cells in _in_files(section)[1]]
     tabular = [
-        rf"\begin{{tabular}}{{{''.join('l' if head.left else 'r' for head in heads)}}}",
+        rf"\begin{{tabular}}{{{''.join(map(_aligned, heads))}}}",
         r"\toprule",
         *(" & ".join(row) + r" \\" for row in rows),
         r"\midrule",

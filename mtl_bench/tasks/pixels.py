@@ -14,6 +14,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
 
 BYTES = 256  # values of a uint8
@@ -25,6 +26,13 @@ def where(mask: Tensor) -> Tensor:
     if _by_torch(mask):
         return mask.flatten().nonzero()[:, 0]
     return torch.from_numpy(np.flatnonzero(_array(mask)))
+
+
+def filled(value_HW: NDArray[Any], known_HW: NDArray[np.bool_]) -> NDArray[Any]:
+    """Each pixel that is not known has the nearest known one's value."""
+    at = ndimage.distance_transform_edt(~known_HW, return_distances=False, return_indices=True)
+    found: NDArray[Any] = value_HW[tuple(at)]
+    return found
 
 
 def equal(map_: Tensor, value: int) -> Tensor:

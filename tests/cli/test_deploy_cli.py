@@ -124,3 +124,4 @@ def test_export_prints_the_names(tmp_path):
     assert result.exit_code == 0, result.output
     assert out.is_file()
     assert "outputs  semantic, center, offset, inverse_depth" in result.output
+    assert f"{tmp_path / 'net.json'}  what each of them is" in result.output

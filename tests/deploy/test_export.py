@@ -1,5 +1,6 @@
 """Exported graphs: they pass the checker, say what they are, and compute what the network does."""
 
+import copy
 import json
 import sys
 
@@ -55,7 +56,7 @@ def test_the_file_passes_the_checker_and_says_what_it_is(tmp_path):
     image = found.graph.input[0]
     assert image.type.tensor_type.elem_type == onnx.TensorProto.UINT8
     assert [d.dim_value for d in image.type.tensor_type.shape.dim] == [1, *SIZE, 3]
-    assert [p.name for p in path.parent.iterdir()] == ["net.onnx"]
+    assert {p.name for p in path.parent.iterdir()} == {"net.json", "net.onnx"}
 
 
 MAPS = {
@@ -64,9 +65,9 @@ MAPS = {
     ("depth",): ["inverse_depth"],
 }
 RESULTS = {
-    TASKS: ["panoptic", "depth_m", "points"],
+    TASKS: ["panoptic", "depth_m", "depth", "scale", "points"],
     ("panoptic",): ["panoptic"],
-    ("depth",): ["depth_m", "points"],
+    ("depth",): ["depth_m", "depth", "scale", "points"],
 }
 
 
@@ -93,6 +94,60 @@ def test_apart_the_two_files_fit_together(tmp_path, tasks):
         assert np.allclose(maps["inverse_depth"], out.maps["depth"]["inverse"], rtol=1e-4)
     found = run(second, maps | {name: CAMERA[name] for name in camera})
     assert list(found) == RESULTS[tasks]
+    described(first.with_suffix(".json"), (first, second))
+    if "depth" in tasks:  # a wall of one depth: no ground, so no metres, and the rest as it is
+        maps["inverse_depth"][:] = 0.5
+        maps |= {"semantic": np.zeros_like(maps["semantic"])} if "panoptic" in tasks else {}
+        found = run(second, maps | {name: CAMERA[name] for name in camera})
+        assert np.isnan(found["scale"]).all()
+        assert np.isnan(found["depth_m"]).all()
+        assert (found["depth"] == 2).all()
+
+
+def described(path, files):
+    """Everything that the files have stands in the JSON file with what it is."""
+    about = json.loads(path.read_text())
+    assert list(about["files"]) == [file.name for file in files]
+    for file in files:
+        inputs, outputs = names(file)
+        own = about["files"][file.name]
+        assert (list(own["inputs"]), list(own["outputs"])) == (inputs, outputs)
+        assert all(port["what"] for side in own.values() for port in side.values())
+    image = about["files"][files[0].name]["inputs"]["image"]
+    assert (image["type"], image["axes"]) == ("uint8", [1, *SIZE, 3])
+    assert about["classes"][1] == {"index": 1, "name": "road", "label_id": 7, "thing": False}
+
+
+def test_height_and_width_may_be_free(tmp_path):
+    path = tmp_path / "net.onnx"
+    net = model("tiny").net
+    export.export(net, SIZE, path, "none", multiple=32)
+    about = json.loads(path.with_suffix(".json").read_text())
+    assert about["height"] == "multiples of 32"
+    assert about["files"]["net.onnx"]["inputs"]["image"]["axes"][1:3] == ["32*height", "32*width"]
+    for size in (SIZE, (32, 96), (160, 64)):
+        image = images(1, size)[0]
+        found = run(path, {"image": image.numpy()})
+        with torch.no_grad():
+            own = net(image.permute(0, 3, 1, 2).float() / 255).maps
+        assert (found["semantic"] == own["panoptic"]["semantic"].argmax(1).numpy()).mean() > 0.999
+        assert np.allclose(found["inverse_depth"], own["depth"]["inverse"], rtol=1e-4)
+
+
+def test_what_is_made_for_one_size_says_so(tmp_path):
+    with pytest.raises(ValueError, match="--dynamic goes with --post none"):
+        export.export(model("tiny").net, SIZE, tmp_path / "net.onnx", "inside", multiple=32)
+    net = copy.deepcopy(model("tiny").net)
+    place = torch.zeros(SIZE[0] // 32, SIZE[1] // 32)  # as a learned place of each cell is
+    net.backbone.register_forward_hook(lambda *given: given[-1] | {32: given[-1][32] + place})
+    with pytest.raises(ValueError, match="made for one size: leave out --dynamic"):
+        export.export(net, SIZE, tmp_path / "net.onnx", "none", multiple=32)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_description_needs_its_name(tmp_path):
+    with pytest.raises(ValueError, match="is the name of the file that describes it"):
+        export.export(model("tiny").net, SIZE, tmp_path / "net.json", "none")
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ from mtl_bench.model import Outputs, build_model
 from mtl_bench.show.predict import Predictor, video
 from mtl_bench.show.predict import job as predictions
 from mtl_bench.show.predict.cameras import Given, camera_of
-from mtl_bench.tasks.depth.picture import HEIGHTS, UNSCALED
+from mtl_bench.tasks.depth.picture import HEIGHTS, UNSCALED, DepthView
 
 ROAD, SKY, EGO = (CITYSCAPES20.index(name) for name in ("road", "sky", "ego vehicle"))
 RUNNER = CliRunner()
@@ -118,6 +118,17 @@ def test_without_ground_depth_stays_in_the_networks_unit():
     assert (surface.unit, surface.source) == (UNSCALED, "failed")
     assert surface.camera_height is None
     assert np.allclose(surface.depth_HW, 10)
+
+
+def test_depth_without_a_scale_is_written_with_enough_digits():
+    near = np.linspace(0.96, 1.04, 10_000, dtype=np.float32).reshape(100, 100)
+    for farthest in (1.04, 70.0, 65535.0):
+        view = DepthView(np.where(near < 1.04, near, np.float32(farthest)), UNSCALED)
+        written = view.files("depth", PHOTO)["depth"]
+        assert np.abs(written / view.steps - view.depth_HW).max() <= 0.5 / view.steps
+        assert written.max() > 2**15 - 1
+    assert len(np.unique(DepthView(near, UNSCALED).files("depth", PHOTO)["depth"])) > 2000
+    assert DepthView(near, HEIGHTS).steps == DepthView(near, METRES).steps == 256
 
 
 def test_what_is_void_has_no_class():
@@ -344,7 +355,8 @@ def test_images_become_pictures_and_numbers(run, tree):
         seen = np.sort(cloud["points"][:, 2])
     steps = np.sort(depth[depth > 0])
     assert len(steps) == len(seen), "the same pixels"
-    assert np.abs(steps / 256 - seen.clip(max=65535 / 256)).max() <= 0.5 / 256 + 1e-4
+    of_a_unit = record["depth_steps_of"].get("plain", record["depth_steps"])
+    assert np.abs(steps / of_a_unit - seen.clip(max=65535 / 256)).max() <= 0.5 / of_a_unit + 1e-4
     assert Path(f"{base}points.ply").is_file()
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from mtl_bench.core.canvas import Image
-from mtl_bench.core.view import Surface
+from mtl_bench.core.view import STEPS, Surface
 from mtl_bench.data.cameras import Mounted
 from mtl_bench.show.predict import Predicted, Predictor
 from mtl_bench.show.predict.cameras import Given, camera_of
@@ -44,6 +44,7 @@ class Job:
     frames: int = 0
     predict_s: float = 0.0
     scales: Counter[str] = field(default_factory=Counter)  # "m by road": frames
+    steps: dict[str, int] = field(default_factory=dict)  # of frames whose depth files have others
     began: float = field(default_factory=time.perf_counter)
 
     def predict(self, name: str, image_HW3: Image, camera: Mounted) -> Predicted:
@@ -53,6 +54,8 @@ class Job:
         self.predict_s += time.perf_counter() - start
         if predicted.surface is not None:
             self.scales[_scale_in_words(predicted.surface)] += 1
+            if predicted.surface.steps != STEPS:
+                self.steps[name] = predicted.surface.steps
         if self.recording is not None:
             self.recording.add(self.frames, name, predicted)
         return predicted
@@ -73,6 +76,8 @@ class Job:
             "frames": self.frames,
             "network_size": list(self.predictor.size),
             "depth": dict(self.scales),
+            "depth_steps": STEPS,  # of a unit, in NAME_depth.png
+            "depth_steps_of": self.steps,
             "fps": self.fps,
             "fps_of_predicting": self.frames / self.predict_s,  # without reading and writing
         }

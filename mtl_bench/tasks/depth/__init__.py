@@ -8,12 +8,12 @@ medians (it looks at the truth), `depth_dgc` by the camera's height above the gr
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor, nn
 
 from mtl_bench.core.batch import Batch, Camera
@@ -24,7 +24,8 @@ from mtl_bench.core.labels import GROUND, NO_SURFACE, LabelSet
 from mtl_bench.core.recipe import Evaluate, Network
 from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
-from mtl_bench.core.view import METRES
+from mtl_bench.core.view import METRES, STEPS
+from mtl_bench.data import png
 from mtl_bench.model.layers import Decoder, Head, full
 from mtl_bench.tasks import pixels
 from mtl_bench.tasks.depth import protocols
@@ -72,7 +73,16 @@ class Depth(Task):
     after = ("panoptic",)  # the ground, which the scale is taken from
     averages_flip = True
     maps: ClassVar[Mapping[str, MapInfo]] = {"inverse": MapInfo("inverse_depth", quantity="depth")}
-    exported = ("depth_m",)
+    exported = ("depth_m", "depth", "scale")
+    meaning: ClassVar[Mapping[str, str]] = {
+        "inverse_depth": "1 / depth along the optical axis, without scale",
+        "depth_m": "along the optical axis in the unit of camera_height_m: scale * depth; NaN "
+        "everywhere where no ground was found. Classes without a surface have values, too",
+        "depth": "along the optical axis, without scale: what is left where no ground was found",
+        "scale": "from depth to depth_m, from the camera's height above the ground; NaN: no ground",
+        "points": "in the camera's frame: x right, y down, z forward, in the unit of "
+        "camera_height_m; NaN where no ground was found or the class has no surface",
+    }
     has_points = True
     reads_camera = True
     columns = (
@@ -100,6 +110,7 @@ class Depth(Task):
         ),
     )
     files = ("depth", "points")
+    scored = ("_depth.png", "_depth.npy", ".png", ".npy")
     drawn: ClassVar[Mapping[str, str]] = {
         "depth_m": "depth (median-scaled, 2 m bright to 80 m dark, gray without value)",
     }
@@ -237,6 +248,23 @@ class Depth(Task):
             "dgc_ground": "predicted road" if set(self.after) & set(tasks) else "normals",
         }
 
+    def read_result(self, path: Path, size: Size) -> Results:
+        """Metres, in .npy or in 1/256 as a PNG of 16 bits; as they are where dgc would scale them.
+
+        Pixels without a value take the nearest one's, as KITTI's evaluator fills them.
+        """
+        depth_HW = _array(path) if path.suffix == ".npy" else png.read(path, 16) / STEPS
+        known_HW = np.isfinite(depth_HW) & (depth_HW > 0)
+        if depth_HW.ndim != 2 or not known_HW.any():
+            raise ValueError(f"{path}: no depth of a pixel in it, or not one map [H,W]")
+        depth_HW = pixels.filled(depth_HW.astype(np.float32), known_HW)
+        inverse = {"inverse": torch.from_numpy(1 / depth_HW)[None, None]}
+        if depth_HW.shape != size:
+            inverse = self.resized(inverse, size)
+        depth_B1HW = depth_from_inverse(inverse["inverse"])
+        ones, road = torch.ones(1), torch.full((1,), ROAD)
+        return {"depth": depth_B1HW, "scale": ones, "source": road, "depth_m": depth_B1HW}
+
     def trivial(self, size: Size) -> Trivial:
         return MeanDepth(self.recipe.evaluate, size)
 
@@ -259,6 +287,14 @@ class Depth(Task):
     @classmethod
     def drawn_view(cls, name: str, map_HW: NDArray[Any], labels: LabelSet) -> DepthView:
         return DepthView(np.asarray(map_HW, np.float32), METRES)
+
+
+def _array(path: Path) -> NDArray[Any]:
+    try:
+        found: NDArray[Any] = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{path}: no .npy file of numbers ({error})") from error
+    return found
 
 
 def _classes(results: Mapping[str, Results], key: str) -> Tensor | None:
@@ -354,12 +390,8 @@ class MeanDepth(Trivial):
         """Where no depth was ever valid, the nearest pixel's that has one."""
         if not self.depth_count.any():
             raise ValueError("no frame of the training split has a valid depth")
-        nearest = ndimage.distance_transform_edt(
-            self.depth_count == 0, return_distances=False, return_indices=True
-        )
         mean_HW = self.depth_sum / np.maximum(self.depth_count, 1)
-        found: NDArray[np.float32] = mean_HW[tuple(nearest)].astype(np.float32)
-        return found
+        return pixels.filled(mean_HW, self.depth_count > 0).astype(np.float32)
 
     def result(self, count: int, size: Size) -> Results:
         depth_m_HW = torch.from_numpy(pixels.sampled(self.depth_m_HW(), size))

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from mtl_bench.core import canvas
 from mtl_bench.core.canvas import Image, LogScale
-from mtl_bench.core.view import METRES, Key, Surface, View
+from mtl_bench.core.view import METRES, STEPS, Key, Surface, View
 
 HEIGHTS, UNSCALED = "camera heights", "network units"
 RANGES = {METRES: (2.0, 80.0), HEIGHTS: (1.5, 60.0)}  # ends of the colours, by unit
-STEPS = 256  # of a unit in a depth file
+LARGEST = 2**16 - 1  # value of a depth file
 _TABLE = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[::-1, None], cv2.COLORMAP_INFERNO)
 TABLE = np.asarray(_TABLE[:, 0, ::-1], np.uint8)  # RGB, near first
 
@@ -36,6 +36,13 @@ class DepthView(Surface):
 
     task = "depth"
 
+    @property
+    def steps(self) -> int:
+        """Without a scale the largest power of 2 that the farthest pixel allows."""
+        if self.unit in RANGES:
+            return STEPS
+        return int(2 ** np.floor(np.log2(LARGEST / max(self.depth_HW.max(), 1))))
+
     def scale(self, depth: NDArray[np.floating[Any]]) -> LogScale:
         return scale_of(depth, self.unit)
 
@@ -50,10 +57,10 @@ class DepthView(Surface):
         return canvas.stack([colors, scale.bar(colors.shape[1])])
 
     def files(self, kind: str, image_HW3: Image) -> dict[str, NDArray[Any]]:
-        """`depth_colors` with a scale bar; `depth`, 16 bits in 1/256 of the unit, 0 = no value."""
+        """`depth_colors` with a scale bar; `depth`, 16 bits in 1/`steps` of the unit, 0 = none."""
         if kind != "depth":
             return {}
-        steps_HW = np.rint(self.depth_HW * STEPS).clip(0, 2**16 - 1)
+        steps_HW = np.rint(self.depth_HW * self.steps).clip(0, LARGEST)
         return {"depth_colors": self.explained(image_HW3), "depth": steps_HW.astype(np.uint16)}
 
     @classmethod

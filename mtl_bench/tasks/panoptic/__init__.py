@@ -17,13 +17,13 @@ from torch import Tensor, nn
 from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.columns import Column
 from mtl_bench.core.dataset import LabelFrames
-from mtl_bench.core.labels import IGNORE, LabelSet, class_of_instance_id
+from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet, class_of_instance_id
 from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
 from mtl_bench.model.layers import Decoder, Head, full, init_fan_in
 from mtl_bench.tasks.panoptic import grouping, pseudo_labels
-from mtl_bench.tasks.panoptic.files import write_panoptic
+from mtl_bench.tasks.panoptic.files import read_ids, write_panoptic
 from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_loss
 from mtl_bench.tasks.panoptic.metrics import PanopticQuality, SemanticIoU
 from mtl_bench.tasks.panoptic.picture import PanopticView
@@ -74,6 +74,13 @@ class Panoptic(Task):
         "offset": MapInfo("offset"),
     }
     exported = ("panoptic",)
+    meaning: ClassVar[Mapping[str, str]] = {
+        "semantic": "class index",
+        "center": "heat of instances' centers, in [0, 1], not thresholded",
+        "offset": "(y, x) from each pixel to its instance's center, pixels",
+        "panoptic": f"class index * {DIVISOR} + instance from 1; instance 0: stuff, or a thing in "
+        f"an image without any center; {grouping.VOID}: no segment",
+    }
     makes_labels = True
     columns = (
         Column(
@@ -87,6 +94,7 @@ class Panoptic(Task):
         Column("miou", "semantic.miou", "mIoU", +1, 1, "%", in_delta=True, short=True),
     )
     files = ("overlay", "ids")
+    scored = ("_instanceIds.png", "_panoptic.png", ".png")
     drawn: ClassVar[Mapping[str, str]] = {"instance_ids": "panoptic maps"}
     agreement = (
         Column(
@@ -226,6 +234,25 @@ class Panoptic(Task):
             for name, results in frames
         )
         return write_panoptic(out, split, ids)
+
+    def read_result(self, path: Path, size: Size) -> Results:
+        """Instance ids, of 16 bits or as the official evaluator reads them; they give the class."""
+        ids_HW = read_ids(path)
+        if ids_HW.shape != size:
+            raise ValueError(f"{path}: {ids_HW.shape} pixels where the truth has {size}")
+        class_HW = class_of_instance_id(self.labels)[ids_HW]
+        values, segment_HW = np.unique(ids_HW, return_inverse=True)
+        numbered = values >= DIVISOR
+        if numbered.sum() >= DIVISOR:
+            raise ValueError(f"{path}: {numbered.sum()} instances; at most {DIVISOR - 1} are told")
+        number = np.where(numbered, numbered.cumsum(), 0)[segment_HW].reshape(size)
+        ids = np.where(
+            class_HW == IGNORE, grouping.VOID, class_HW.astype(np.int32) * DIVISOR + number
+        )
+        return {
+            "class": torch.from_numpy(class_HW)[None],
+            "panoptic": torch.from_numpy(ids.astype(np.int32))[None],
+        }
 
     def trivial(self, size: Size) -> Trivial:
         return MostFrequentClass(self.labels, self.recipe, size)

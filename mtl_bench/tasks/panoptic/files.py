@@ -1,4 +1,5 @@
-"""Panoptic predictions as files that the official Cityscapes evaluator reads (COCO's format).
+"""Panoptic predictions as files that the official Cityscapes evaluator reads (COCO's format), and
+such files of others.
 
 `<out>/cityscapes_panoptic_<split>.json` and beside it a folder of that name with one PNG a frame,
 whose pixels hold segment ids as R + 256 G + 65536 B:
@@ -6,6 +7,7 @@ whose pixels hold segment ids as R + 256 G + 65536 B:
     csEvalPanopticSemanticLabeling --gt-json-file ... --prediction-json-file <out>/...json
 """
 
+import functools
 import json
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,9 +16,11 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from mtl_bench.core.files import write_text
-from mtl_bench.core.labels import DIVISOR
+from mtl_bench.core.files import read_json, write_text
+from mtl_bench.core.labels import DIVISOR, LARGEST_ID
+from mtl_bench.data import png
 
 
 def write_panoptic(out: Path, split: str, frames: Iterable[tuple[str, NDArray[Any]]]) -> Path:
@@ -38,3 +42,52 @@ def write_panoptic(out: Path, split: str, frames: Iterable[tuple[str, NDArray[An
     path = base.with_suffix(".json")
     write_text(path, json.dumps({"annotations": annotations}))  # last: it exists = all are there
     return path
+
+
+def read_ids(path: Path) -> NDArray[Any]:
+    """A map [H,W] of instance ids from a PNG: of 16 bits, or in colours as `write_panoptic`'s.
+
+    The segments of colours have the categories that `<folder>.json` says; without it a segment's
+    id is an instance id.
+
+    Raises:
+        ValueError: another PNG, an id that is none, or a segment that the JSON file lacks.
+    """
+    if png.read_header(path).bits == 16:
+        return png.read(path, 16)
+    try:
+        with Image.open(path) as image:
+            rgb_HW3 = np.asarray(image.convert("RGB"), np.int32)
+    except OSError as error:
+        raise ValueError(f"{path}: damaged PNG ({error})") from error
+    ids_HW = rgb_HW3 @ np.array([1, 2**8, 2**16], np.int32)
+    values, place_HW = np.unique(ids_HW, return_inverse=True)
+    listed = _segments(path.parent.with_suffix(".json"))
+    if listed is not None:
+        own = listed.get(path.name, {})
+        lacking = [value for value in values.tolist() if value > 0 and value not in own]
+        if lacking:
+            raise ValueError(f"{path}: {path.parent.name}.json has no segment {lacking[0]} of it")
+        numbers: dict[int, int] = {}
+        for place, value in enumerate(values.tolist()):
+            category = own.get(value, 0)
+            if value >= DIVISOR or category != value:  # a bare label id stays one
+                numbers[category] = numbers.get(category, 0) + 1
+                values[place] = category * DIVISOR + numbers[category] if category else 0
+    if values.max() > LARGEST_ID:
+        raise ValueError(
+            f"{path}: {values.max()} is no instance id, and no {path.parent.name}.json"
+        )
+    return values[place_HW].reshape(ids_HW.shape)
+
+
+@functools.cache
+def _segments(path: Path) -> dict[str, dict[int, int]] | None:
+    """Of every file the segments' ids and their categories; None without such a JSON file."""
+    found = read_json(path)
+    if found is None:
+        return None
+    return {
+        each["file_name"]: {one["id"]: one["category_id"] for one in each["segments_info"]}
+        for each in found["annotations"]
+    }
