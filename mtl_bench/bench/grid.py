@@ -192,9 +192,12 @@ def load_grid(
 
 # --- the file -------------------------------------------------------------------------------------
 
-SHARED: dict[str, type] = {"kind": str, "question": str, "axes": dict, "skip": list, "report": dict}
+SHARED: dict[str, type] = {"kind": str, "question": str, "axes": dict, "skip": list}
 KINDS: dict[str, tuple[Kind[Any], dict[str, type]]] = {  # a file's `kind` -> its keys
-    "training": (CELLS, {"recipe": str, "smoke_recipe": str, "row": list, "baseline": dict}),
+    "training": (
+        CELLS,
+        {"recipe": str, "smoke_recipe": str, "row": list, "baseline": dict, "report": dict},
+    ),
     "latency": (TIMINGS, {"smoke": dict, "weights": dict, "quality": dict}),
 }
 

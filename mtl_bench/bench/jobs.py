@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 from mtl_bench.core import plugins, provenance
 from mtl_bench.core.columns import FPS
-from mtl_bench.core.config import Cell, Recipe, load_recipe
+from mtl_bench.core.config import Cell, Recipe, check_cells, load_recipe
 from mtl_bench.core.files import read_json
 from mtl_bench.core.fingerprint import STAGES, Root, fingerprints, of_package
 from mtl_bench.core.plain import did_you_mean, from_dict, to_dict
@@ -251,7 +251,7 @@ class Cells(Kind[Cell]):
         return float(sum(v for k, v in row.get("time", {}).items() if k.endswith("_s")))
 
     def check(self, jobs: Iterable[Cell]) -> None:
-        plugins.check_cells(jobs)
+        check_cells(jobs)
 
 
 class Timings(Kind[Timing]):
@@ -304,7 +304,7 @@ class Timings(Kind[Timing]):
                 plugins.path_of("tasks", task)
             plugins.path_of("backbones", timing.backbone)
             arguments = timing.backbone_args
-            known = plugins.settings("backbones", timing.backbone) if arguments else {}
+            known = plugins.arguments("backbones", timing.backbone) if arguments else {}
             for key in arguments.keys() - known.keys():
                 hint = did_you_mean(key, known)
                 raise ValueError(f"backbone '{timing.backbone}' has no '{key}'{hint}")

@@ -81,6 +81,10 @@ def ablate(
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
     chosen.kind.check(chosen.jobs)
+    if chosen.kind is CELLS:
+        from mtl_bench.report import grid as of_cells
+
+        of_cells.check(chosen)
     todo = store.to_run(chosen.jobs, runs, rerun)
     for job in [] if dry_run else todo:
         if isinstance(job, Cell):

@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +202,24 @@ def _definitions(target: Target) -> Iterator[tuple[Path, str]]:
             yield from _definitions(Target(other, target.name))
 
 
+def with_helpers(path: Path) -> list[Path]:
+    """A file and those outside of this package that it imports, directly or through another.
+
+    Raises:
+        ValueError: a file that is no Python.
+    """
+    found, left = {path}, [path]
+    while left:
+        path = left.pop()
+        every = [imported(node, path).values() for node in load(path).importing]
+        targets = [(t.path, t.name) for t in chain.from_iterable(every) if t.path is not None]
+        beside = {file for file, _ in targets} | {_submodule(f, n) for f, n in targets if n}
+        new = {p for p in beside - found if p is not None and p.is_file() and not ours(p)}
+        found |= new
+        left += new
+    return sorted(found)
+
+
 # --- files ----------------------------------------------------------------------------------------
 
 
@@ -253,7 +272,10 @@ class Module:
         try:
             tree = ast.parse(path.read_bytes(), str(path))
         except (SyntaxError, ValueError) as error:  # ValueError: null bytes
-            raise ValueError(f"{path}: {type(error).__name__}: {error.args[0]}") from None
+            line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+            raise ValueError(f"{path}{line}: {type(error).__name__}: {error.args[0]}") from None
+        statements = (ast.Import, ast.ImportFrom)
+        self.importing = [node for node in ast.walk(tree) if isinstance(node, statements)]
         for statement in tree.body:
             self._see(statement)
 
@@ -586,7 +608,10 @@ class _Normal:
                 return scope[name]
         if name in self.module.statements:
             return Target(self.module.path, name)
-        return self.module.imports.get(name)
+        if name in self.module.imports:
+            return self.module.imports[name]
+        starred = (Target(path, name) for path in self.module.stars)
+        return next((target for target in starred if any(_definitions(target))), None)
 
 
 def _sha(*texts: str) -> str:
