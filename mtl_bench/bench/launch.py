@@ -490,7 +490,7 @@ def _recorded(directory: Path) -> Iterator[None]:
     (directory / "failed.json").unlink(missing_ok=True)
     try:
         yield
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # the latter a plug-in's
         line = " ".join(f"{type(error).__name__}: {error}".split())
         store.write_failure(directory, line, traceback.format_exc())
         raise

@@ -226,7 +226,7 @@ def with_helpers(path: Path) -> list[Path]:
 def _stamp(path: Path) -> tuple[int, int] | None:
     try:
         status = path.stat()
-    except FileNotFoundError:
+    except OSError:  # gone, or a link that leads nowhere
         return None
     return status.st_mtime_ns, status.st_size
 
@@ -258,6 +258,20 @@ def _submodule(path: Path, name: str) -> Path | None:
     return _module_file(path.parent / name) if path.stem == "__init__" else None
 
 
+def content(path: Path) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        ValueError: what has this name is no file that can be read, such as a link to nowhere.
+    """
+    if not path.is_file():
+        raise ValueError(f"no file to read: {path}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"no file to read, {error.strerror}: {path}") from None
+
+
 class Module:
     """A file's top level: what it defines, imports and does."""
 
@@ -269,8 +283,9 @@ class Module:
         self.effects: list[ast.stmt] = []  # what runs on import and defines nothing
         self._codes: dict[tuple[str, str], Code] = {}
         self._stages: dict[str, dict[str, set[str]] | None] = {}
+        text = content(path)
         try:
-            tree = ast.parse(path.read_bytes(), str(path))
+            tree = ast.parse(text, str(path))
         except (SyntaxError, ValueError) as error:  # ValueError: null bytes
             line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
             raise ValueError(f"{path}{line}: {type(error).__name__}: {error.args[0]}") from None

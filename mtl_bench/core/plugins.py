@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mtl_bench.core.fingerprint import ancestry, forget_edited, of_package, with_helpers
+from mtl_bench.core.fingerprint import ancestry, content, forget_edited, of_package, with_helpers
 from mtl_bench.core.fingerprint import load as load_text
 from mtl_bench.core.plain import did_you_mean
 
@@ -47,7 +47,8 @@ SHIPPED = {  # in the package; the others have a folder of their own beside it
     "engines": PACKAGE / "deploy" / "engines",
 }
 GIVEN = ("self", "terms", "seed", "strides", "pretrained")  # the harness fills these arguments in
-NAME = re.compile(r"[a-z][a-z0-9_]*")
+NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders are called by it
+NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
 PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
 
 
@@ -98,7 +99,7 @@ def path_of(kind: str, name: str) -> Path:
     """The file of a plug-in.
 
     Raises:
-        ValueError: an unknown name, or one that two files have.
+        ValueError: an unknown name, one that two files have, or what is no name.
     """
     word, paths = kind[:-1], _candidates(kind).get(name)
     if paths is None:
@@ -108,6 +109,8 @@ def path_of(kind: str, name: str) -> Path:
         )
     if len(paths) > 1:
         raise ValueError(f"two {kind} are called '{name}': {paths[0]} and {paths[1]}; rename one")
+    if not NAME.fullmatch(name):
+        raise ValueError(f"'{name}' {NAMED}; rename {paths[0]}")
     return paths[0]
 
 
@@ -121,7 +124,7 @@ def _candidates(kind: str) -> dict[str, list[Path]]:
     paths = [path for folder in folders(kind) for path in _files_in(folder)]
     extra = (Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep))
     paths += [path for path in extra if path.is_file()]
-    for path in dict.fromkeys(path.resolve() for path in paths):
+    for path in dict.fromkeys(path.resolve() if path.is_file() else path for path in paths):
         if _kind_of(path) == kind:
             found.setdefault(name_of(path), []).append(path)
     return dict(sorted(found.items()))
@@ -141,9 +144,14 @@ def _kind_of(path: Path) -> str | None:
     folder = path.parent.parent if path.stem == "__init__" else path.parent
     for kind, place in SHIPPED.items():
         if folder == place:  # other modules lie beside the plug-ins
-            return kind if _derives(path, kind) else None
+            try:
+                return kind if _derives(path, kind) else None
+            except ValueError:  # listed as broken
+                return kind
     if folder.name in KINDS:
         return folder.name
+    if not path.is_file():  # a link that leads nowhere
+        return None
     text = path.read_text(encoding="utf-8", errors="replace")
     for kind, (module, base) in BASES.items():
         package, _, last = module.rpartition(".")
@@ -190,8 +198,8 @@ def describe(kind: str) -> list[Description]:
 def _describe(name: str, paths: list[Path]) -> Description:
     path = paths[0]
     try:
-        tree = ast.parse(path.read_bytes(), str(path))
-    except (SyntaxError, ValueError) as error:  # ValueError: null bytes
+        tree = _parse(content(path))
+    except (SyntaxError, ValueError) as error:  # ValueError: null bytes, or no file
         line = f" (line {error.lineno})" if isinstance(error, SyntaxError) else ""
         return Description(name, "", path, f"{type(error).__name__}: {error.args[0]}{line}")
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
@@ -201,7 +209,7 @@ def _describe(name: str, paths: list[Path]) -> Description:
     if len(paths) > 1:
         wrong = f"two files have this name: {paths[0]} and {paths[1]}"
     elif not NAME.fullmatch(name):
-        wrong = f"'{name}' is no name: lower-case letters, digits and _"
+        wrong = f"'{name}' {NAMED}"
     elif not classes:
         wrong = "defines no class"
     elif missing:
@@ -230,7 +238,7 @@ def attributes(kind: str, name: str) -> dict[str, Any]:
     Raises:
         ValueError: an unknown or ambiguous name.
     """
-    return dict(_attributes(path_of(kind, name).read_bytes()))
+    return dict(_attributes(content(path_of(kind, name))))
 
 
 @functools.cache
@@ -246,8 +254,8 @@ def readable(kind: str) -> list[str]:
     """Names whose attributes can be read: of one file, which is Python."""
     found = []
     for name, paths in _candidates(kind).items():
-        with contextlib.suppress(SyntaxError, ValueError):  # ValueError: null bytes
-            _parse(paths[0].read_bytes())
+        with contextlib.suppress(SyntaxError, ValueError):  # ValueError: null bytes, or no file
+            _parse(content(paths[0]))
             found += [name] * (len(paths) == 1)
     return found
 
@@ -355,7 +363,7 @@ def load(kind: str, name: str) -> type[Any]:
     importlib.invalidate_caches()
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         line = next(
             (
                 f", line {f.lineno}"
