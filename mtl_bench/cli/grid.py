@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -234,6 +235,7 @@ class Choice:
             settings=self.settings or [],
             pretrained=o.weights(self.pretrained),
             device=device.value,
+            say=partial(typer.echo, err=True),
         )
 
     @property

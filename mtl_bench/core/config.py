@@ -10,12 +10,12 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
-from mtl_bench.core import plugins
+from mtl_bench.core import plugins, toml_file
 from mtl_bench.core.plain import (
     DISTINCT,
     Checked,
@@ -25,6 +25,7 @@ from mtl_bench.core.plain import (
     one_of,
     to_dict,
 )
+from mtl_bench.core.plugins import IS_NAME
 from mtl_bench.core.recipe import (
     Augment,
     Data,
@@ -66,6 +67,7 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
 NOT_SET = {
     "recipe.tasks": "a cell has its own, tasks",
     "recipe.name": "a recipe is called as its file",
+    "recipe.about": "it is said in the recipe's file",
     "method_args": "its settings are method.KEY",
     "backbone_args": "its settings are backbone.KEY",
 }
@@ -84,9 +86,11 @@ class Cell(Checked):
     """
 
     recipe: Recipe
-    backbone: Annotated[str, "its name, see `list backbones`"]
-    method: Annotated[str, "a name, or a loss-value method and a gradient method: a+b"]
-    tasks: Annotated[tuple[str, ...], DISTINCT, "names; none: the recipe's"] = ()
+    backbone: Annotated[str, IS_NAME, "its name, see `list backbones`"]
+    method: Annotated[str, IS_NAME, "a name, or a loss-value method and a gradient method: a+b"]
+    tasks: Annotated[
+        tuple[Annotated[str, IS_NAME], ...], DISTINCT, "names; none: the recipe's"
+    ] = ()
     seed: Annotated[Whole, "of initial weights, data order and method"] = 0
     video: Annotated[bool, "the second training, on pseudo-labeled frames too"] = False
     single_task: Annotated[bool, "one network a task, each trained alone"] = False
@@ -120,7 +124,7 @@ class Cell(Checked):
             return tuple(replace(self, single_task=False, tasks=(task,)) for task in self.tasks)
         return (replace(self, video=False),) if self.video else ()
 
-    @property
+    @cached_property
     def id(self) -> str:
         """12 hexadecimal digits of the canonical JSON: recipe values, not the recipe's name."""
         return hashlib.sha256(canonical_json(self).encode()).hexdigest()[:12]
@@ -231,8 +235,8 @@ def load_recipe(name: str) -> Recipe:
     path = Path(name) if name.endswith(".toml") else RECIPES / f"{name}.toml"
     if not path.is_file():
         raise ValueError(f"no recipe called '{name}'{did_you_mean(name, recipe_names())}")
+    values = toml_file.read(path).values
     try:
-        values = tomllib.loads(path.read_text())
         return from_dict(Recipe, {"name": path.stem, **values})
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -267,6 +271,8 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
 def set_values(cell: Cell, settings: Mapping[str, Any]) -> Cell:
     """As `override`, with values as they are; below `method.` and `backbone.` sections are made."""
+    if not settings:
+        return cell
     values = to_dict(cell)
     for key, value in settings.items():
         if key in NOT_SET:

@@ -6,6 +6,7 @@ checks them and by what lists them.
 """
 
 import dataclasses
+import math
 import sys
 import typing
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -41,10 +42,11 @@ def one_of(*values: str) -> Rule:
     return Rule(" or ".join(values), lambda value: value in values)
 
 
+FINITE = Rule("finite", math.isfinite)
 ODD = Rule("odd", lambda value: value % 2 == 1)
-SOME = Rule("a list of at least one", lambda value: len(value) > 0)
+SOME = Rule("non-empty", lambda value: len(value) > 0)
 ASCENDING = Rule("ascending", lambda value: sorted(set(value)) == list(value))
-DISTINCT = Rule("a list of different values", lambda value: len(set(value)) == len(value))
+DISTINCT = Rule("without repetitions", lambda value: len(set(value)) == len(value))
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Setting:
 
     key: str
     kind: str
-    default: Any
+    default: Any  # dataclasses.MISSING: it has none
     rules: str
     about: str
 
@@ -80,9 +82,8 @@ def settings_of(kind: type[Any], where: str = "") -> Iterator[Setting]:
             continue
         about = "; ".join(word for word in _metadata(of) if isinstance(word, str))
         if about:
-            default = None if field.default is dataclasses.MISSING else field.default
             rules = ", ".join(dict.fromkeys(rule.words for rule in _rules(of)))
-            yield Setting(f"{where}{field.name}", name_of_type(of), default, rules, about)
+            yield Setting(f"{where}{field.name}", name_of_type(of), field.default, rules, about)
 
 
 def to_dict(value: Any) -> Any:
@@ -140,9 +141,9 @@ def convert(kind: Any, value: Any, where: str) -> Any:
     elif origin is Mapping and isinstance(value, Mapping):
         return MappingProxyType({k: convert(args[1], v, f"{where}.{k}") for k, v in value.items()})
     elif kind is float and type(value) in (int, float):
-        if abs(value) <= sys.float_info.max:  # which a whole number may exceed, too
-            return float(value)
-        raise ValueError(f"'{where}' must be a finite number, not {value}")
+        if value != value or (type(value) is int and abs(value) > sys.float_info.max):
+            raise ValueError(f"'{where}' must be a number, not {value}")
+        return float(value)
     elif kind is Any or type(value) is kind:
         return value
     raise ValueError(f"'{where}' must be {name_of_type(kind)}, not {to_dict(value)!r}")

@@ -22,14 +22,14 @@ import re
 import sys
 import traceback
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mtl_bench.core.fingerprint import ancestry, content, forget_edited, of_package, with_helpers
 from mtl_bench.core.fingerprint import load as load_text
-from mtl_bench.core.plain import did_you_mean
+from mtl_bench.core.plain import Rule, did_you_mean
 
 PACKAGE = Path(__file__).resolve().parents[1]
 VARIABLE = "MTL_BENCH_PLUGINS"  # what --plugins adds to; the processes that run cells inherit it
@@ -49,6 +49,11 @@ SHIPPED = {  # in the package; the others have a folder of their own beside it
 GIVEN = ("self", "terms", "seed", "strides", "pretrained")  # the harness fills these arguments in
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders are called by it
 NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
+IS_NAME = Rule(
+    "a name of a-z, 0-9 and _",
+    lambda value: all(NAME.fullmatch(part) for part in part_names(value) if value),
+)
+TOLD = re.compile(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", re.MULTILINE)  # in a section Args
 PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
 
 
@@ -412,6 +417,7 @@ class Argument(NamedTuple):
     kind: Any  # its type, as `plain.convert` takes it; Any where the file says none that is known
     text: str  # its default, as it is written
     default: Any  # its value; ... where it is no literal
+    about: str = ""  # what the class's docstring says of it
 
 
 def arguments(kind: str, name: str) -> dict[str, Argument]:
@@ -425,7 +431,7 @@ def arguments(kind: str, name: str) -> dict[str, Argument]:
     return arguments_of(lineage(kind, path))
 
 
-def arguments_of(line: Iterable[ast.ClassDef]) -> dict[str, Argument]:
+def arguments_of(line: Sequence[ast.ClassDef]) -> dict[str, Argument]:
     """Of a class and its bases, the nearest first: those of the nearest constructor."""
     items = (item for node in line for item in node.body if isinstance(item, ast.FunctionDef))
     for item in items:
@@ -436,11 +442,22 @@ def arguments_of(line: Iterable[ast.ClassDef]) -> dict[str, Argument]:
     plain, keywords = [*item.args.posonlyargs, *item.args.args], item.args.kwonlyargs
     defaults = [*[None] * (len(plain) - len(item.args.defaults)), *item.args.defaults]
     pairs = zip([*plain, *keywords], [*defaults, *item.args.kw_defaults], strict=True)
+    told = _told(line)
     return {
-        found.arg: _argument(found.annotation, default)
+        found.arg: _argument(found.annotation, default)._replace(about=told.get(found.arg, ""))
         for found, default in pairs
         if found.arg not in GIVEN
     }
+
+
+def _told(line: Sequence[ast.ClassDef]) -> dict[str, str]:
+    """Argument -> what the section Args of its class's docstring says; `a, b: ...` is of both."""
+    found: dict[str, str] = {}
+    for node in line:
+        section = (ast.get_docstring(node) or "").partition("\nArgs:\n")[2]
+        for names, text in TOLD.findall(section):
+            found |= {name: " ".join(text.split()) for name in names.split(", ")} | found
+    return found
 
 
 def _argument(annotation: ast.expr | None, written: ast.expr | None) -> Argument:

@@ -7,12 +7,23 @@ type of a field says what it may hold and what it means: see `core/plain.py`.
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from mtl_bench.core.plain import ASCENDING, DISTINCT, ODD, SOME, Checked, above, least, most, one_of
+from mtl_bench.core.plain import (
+    ASCENDING,
+    DISTINCT,
+    FINITE,
+    ODD,
+    SOME,
+    Checked,
+    above,
+    least,
+    most,
+    one_of,
+)
 
 Count = Annotated[int, least(1)]
 Whole = Annotated[int, least(0)]
-Positive = Annotated[float, above(0)]
-NotNegative = Annotated[float, least(0)]
+Positive = Annotated[float, above(0), FINITE]
+NotNegative = Annotated[float, least(0), FINITE]
 Share = Annotated[float, least(0), most(1)]
 
 
@@ -184,10 +195,8 @@ class Recipe(Checked):
     name: str = "paper"
     about: str = ""
     smoke: Annotated[bool, "marks rows that must never be read as results"] = False
-    tasks: Annotated[tuple[str, ...], SOME, DISTINCT, "of a cell that names none"] = (
-        "panoptic",
-        "depth",
-    )
+    # Of a cell that names none
+    tasks: Annotated[tuple[str, ...], SOME, DISTINCT] = ("panoptic", "depth")
     data: Data = field(default_factory=Data)
     augment: Augment = field(default_factory=Augment)
     network: Network = field(default_factory=Network)

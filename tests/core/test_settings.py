@@ -1,12 +1,24 @@
 """Every value that can be set has bounds, one spelling, and a line in `list settings`."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
+from typer.testing import CliRunner
 
+from mtl_bench.cli.app import app
 from mtl_bench.core import config, plugins
-from mtl_bench.core.config import Cell, Recipe, check_cells, from_dict, override, to_dict
+from mtl_bench.core.config import (
+    Cell,
+    Recipe,
+    check_cells,
+    from_dict,
+    override,
+    set_values,
+    to_dict,
+)
+from mtl_bench.core.plain import settings_of
 
 CELL = Cell(Recipe(), "tiny", "famo")
 
@@ -15,8 +27,8 @@ CELL = Cell(Recipe(), "tiny", "famo")
     ("setting", "message"),
     [
         ("recipe.optim.lr=-1", r"'recipe.optim.lr' must be >= 0, not -1"),
-        ("recipe.optim.lr=nan", r"'recipe.optim.lr' must be a finite number, not nan"),
-        ("recipe.optim.lr=inf", r"must be a finite number, not inf"),
+        ("recipe.optim.lr=nan", r"'recipe.optim.lr' must be a number, not nan"),
+        ("recipe.optim.lr=inf", "'recipe.optim.lr' must be finite, not inf"),
         ("recipe.optim.clip=-1", r"'recipe.optim.clip' must be > 0, not -1"),
         ("recipe.optim.steps=0", r"'recipe.optim.steps' must be >= 1, not 0"),
         ("recipe.optim.micro_batch=0", "must be >= 2, not 0"),
@@ -26,10 +38,10 @@ CELL = Cell(Recipe(), "tiny", "famo")
         ("recipe.optim.precision=fp8", "must be fp32 or bf16 or fp16, not 'fp8'"),
         ("recipe.network.channels=0", "'recipe.network.channels' must be >= 1, not 0"),
         ("recipe.network.strides=[16,8,4]", "must be ascending"),
-        ("recipe.augment.scales=[]", "must be a list of at least one"),
+        ("recipe.augment.scales=[]", "must be non-empty"),
         ("recipe.augment.scales=[1, -1]", "must be > 0, not -1"),
         ("recipe.loss.top_fraction=0", "must be > 0, not 0"),
-        ("recipe.loss.scales=[]", "must be a list of at least one"),
+        ("recipe.loss.scales=[]", "must be non-empty"),
         ("recipe.pseudo.scales=[0.0]", "must be > 0"),
         ("recipe.pseudo.min_confidence=2", "must be <= 1, not 2"),
         ("recipe.evaluate.nms_kernel=4", "'recipe.evaluate.nms_kernel' must be odd, not 4"),
@@ -39,9 +51,9 @@ CELL = Cell(Recipe(), "tiny", "famo")
         ("recipe.latency.passes=0", "'recipe.latency.passes' must be >= 1, not 0"),
         ("recipe.data.train_frames=most", "must be published or all, not 'most'"),
         ("seed=-1", "'seed' must be >= 0, not -1"),
-        ('tasks=["depth", "depth"]', "'tasks' must be a list of different values"),
+        ('tasks=["depth", "depth"]', "'tasks' must be without repetitions"),
         ("recipe.tasks=depth", "'recipe.tasks' cannot be set: a cell has its own, tasks"),
-        ("method.lr=nan", "'method.lr' must be a finite number, not nan"),
+        ("method.lr=nan", "'method.lr' must be a number, not nan"),
         ("method.lr=much", "'method.lr' must be float, not 'much'"),
         ("backbone.width=1.5", "'backbone.width' must be int, not 1.5"),
     ],
@@ -82,6 +94,11 @@ def test_weights_of_a_method_are_a_table_of_numbers():
 )
 def test_a_default_that_is_given_and_the_order_of_tasks_make_no_cell_of_their_own(settings):
     assert override(CELL, settings).id == CELL.id
+
+
+def test_infinity_is_a_plug_ins_own_affair():
+    nash = override(replace(CELL, method="nash"), ["method.max_norm=inf"])
+    assert nash.method_args == {"max_norm": float("inf")}
 
 
 def test_one_number_has_one_id_however_it_is_written():
@@ -133,3 +150,39 @@ def test_types_and_defaults_are_read_from_the_file_alone(tmp_path, monkeypatch):
     )
     same = {"rate": 1, "maybe": None, "pair": [0.9, 0.99], "some": [], "table": {}, "word": "a"}
     assert replace(start, method_args=same) == start
+
+
+def test_list_settings_has_every_key_with_type_bounds_default_and_meaning():
+    text = CliRunner().invoke(app, ["list", "settings"]).output
+    for line in (
+        r"recipe.optim.steps +int, >= 1 +60000 +of the optimiser",
+        r"recipe.evaluate.nms_kernel +int, >= 1, odd +7 +pixels",
+        r"recipe.optim.clip +float or none, > 0, finite +0.01 +total gradient norm",
+        r"recipe.network.strides +list of 3 int, .* +\[8, 16, 32\] +pyramid levels",
+        r"seed +int, >= 0 +0 +of initial weights, data order and method",
+        r"method.lr +float +0.025 +famo: of the Adam that moves xi",
+        r"method.weights +table of float +\{\} +fixed: replace single ones",
+        r"backbone.width +int +8 +tiny",
+        r"passes +int, >= 1 +500",
+    ):
+        assert re.search(line, text), line
+    for kind in ("methods", "backbones"):
+        for name in plugins.readable(kind):
+            for key in plugins.arguments(kind, name):
+                assert re.search(rf"{kind[:-1]}.{key} .* {name}", text)
+
+
+def test_what_is_listed_can_be_set_and_what_is_not_cannot():
+    values, listed = to_dict(CELL), {}
+    for setting in settings_of(Cell):
+        listed[setting.key] = setting.default
+        if setting.key not in ("backbone", "method", "tasks"):
+            assert set_values(CELL, {setting.key: setting.default}).id == CELL.id
+    leaves = {key for key in values if key != "recipe"}
+    for key, value in values["recipe"].items():
+        inner = [f".{name}" for name in value] if isinstance(value, dict) else [""]
+        leaves |= {f"recipe.{key}{name}" for name in inner}
+    assert leaves - listed.keys() == set(config.NOT_SET)
+    for key in config.NOT_SET:
+        with pytest.raises(ValueError, match="cannot be set"):
+            set_values(CELL, {key: "x"})
