@@ -70,9 +70,10 @@ engine does not have on the device is skipped.
 """
 
 import itertools
+import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -95,6 +96,8 @@ from mtl_bench.core.toml_file import Place, TomlFile
 from mtl_bench.deploy import engines
 
 GRIDS = Path(__file__).parent / "grids"
+MOST = 10_000  # points of one grid: each takes a millisecond to look at, again and again
+MANY = 1000  # of which the number is said before
 TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
 AXES = ("backbone", "size", "tasks", "engine", "precision")  # of timings
 Values: TypeAlias = Mapping[str, Any]
@@ -166,6 +169,7 @@ def load_grid(
     settings: Sequence[str] = (),
     pretrained: str | None = None,
     device: str = "cpu",
+    say: Callable[[str], None] = print,
 ) -> Grid:
     """A shipped grid by name, or a user's by the path of its TOML file.
 
@@ -178,24 +182,28 @@ def load_grid(
             what a row's "2x" multiplies.
         pretrained: as in `Cell`, for every cell.
         device: auto | cpu | cuda, of timings, where no setting says another.
+        say: is told the number of points where they take their time.
 
     Raises:
         ValueError: no such grid, or a key or value that it cannot have, with file and line.
     """
     file = read(name)
     if kind_of(file) is CELLS:
-        return _of_cells(file, recipe, seeds, smoke, settings, pretrained)
+        return _of_cells(file, recipe, seeds, smoke, settings, pretrained, say)
     for option, value in (("--seeds", seeds), ("--pretrained", pretrained)):
         if value is not None:
             raise ValueError(f"{option} {value}: grid '{name}' times, and trains nothing")
-    return _of_timings(file, recipe, smoke, settings, device)
+    return _of_timings(file, recipe, smoke, settings, device, say)
 
 
 # --- the file -------------------------------------------------------------------------------------
 
-SHARED: dict[str, type] = {"kind": str, "question": str, "axes": dict, "skip": list, "report": dict}
+SHARED: dict[str, type] = {"kind": str, "question": str, "axes": dict, "skip": list}
 KINDS: dict[str, tuple[Kind[Any], dict[str, type]]] = {  # a file's `kind` -> its keys
-    "training": (CELLS, {"recipe": str, "smoke_recipe": str, "row": list, "baseline": dict}),
+    "training": (
+        CELLS,
+        {"recipe": str, "smoke_recipe": str, "row": list, "baseline": dict, "report": dict},
+    ),
     "latency": (TIMINGS, {"smoke": dict, "weights": dict, "quality": dict}),
 }
 
@@ -280,10 +288,25 @@ class Points(ABC):
         return None
 
 
-def _grid(points: Points, axes: Mapping[str, tuple[Any, ...]], *, smoke: bool, **more: Any) -> Grid:
+def _grid(
+    points: Points,
+    axes: Mapping[str, tuple[Any, ...]],
+    say: Callable[[str], None],
+    *,
+    smoke: bool,
+    **more: Any,
+) -> Grid:
     """The product of axes and rows, less the skips; equal jobs count once."""
     file = points.file
     rows: list[Values] = file.values.get("row", [])
+    count = math.prod(map(len, axes.values())) * max(len(rows), 1)
+    if count > MOST:
+        raise ValueError(
+            f"{file.path}: {count} {kind_of(file).noun}s, and a grid may have {MOST}; take values "
+            f"out, or make several grids of it"
+        )
+    if count > MANY:
+        say(f"{file.path.stem}: {count} {kind_of(file).noun}s")
     rules = file.values.get("skip", [])
     jobs: dict[str, Job] = {}
     skips: dict[str, Skip] = {}
@@ -329,6 +352,7 @@ def _of_cells(
     smoke: bool,
     settings: Sequence[str],
     pretrained: str | None,
+    say: Callable[[str], None],
 ) -> Grid:
     axes = _axes(file)
     if seeds is not None:
@@ -351,6 +375,7 @@ def _of_cells(
     grid = _grid(
         points,
         axes,
+        say,
         smoke=smoke,
         recipe=points.start.recipe,
         baseline=MappingProxyType(baseline),
@@ -432,7 +457,12 @@ def _times(cell: Cell, key: str, factor: str) -> Any:
 
 
 def _of_timings(
-    file: TomlFile, recipe: str | None, smoke: bool, settings: Sequence[str], device: str
+    file: TomlFile,
+    recipe: str | None,
+    smoke: bool,
+    settings: Sequence[str],
+    device: str,
+    say: Callable[[str], None],
 ) -> Grid:
     if device == "auto":
         from mtl_bench.core.device import choose_device
@@ -460,7 +490,7 @@ def _of_timings(
             raise file.error(message, key, ("skip", index))
     points = _TimingPoints(file, fixed, weights)
     more = {"recipe": Timing.recipe, "quality": MappingProxyType(quality)}
-    grid = _grid(points, axes, smoke=smoke, **more)
+    grid = _grid(points, axes, say, smoke=smoke, **more)
     return replace(grid, recipe=grid.jobs[0].recipe) if grid.jobs else grid
 
 

@@ -13,15 +13,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Annotated, Any, Generic, TypeAlias, TypeVar
 
 from mtl_bench.core import plugins, provenance
 from mtl_bench.core.columns import FPS
-from mtl_bench.core.config import Cell, Recipe, load_recipe
+from mtl_bench.core.config import Cell, Recipe, check_cells, load_recipe
 from mtl_bench.core.files import read_json
 from mtl_bench.core.fingerprint import STAGES, Root, fingerprints, of_package
-from mtl_bench.core.plain import did_you_mean, from_dict, to_dict
+from mtl_bench.core.plain import (
+    DISTINCT,
+    SOME,
+    Checked,
+    did_you_mean,
+    from_dict,
+    one_of,
+    to_dict,
+)
 from mtl_bench.core.quality import in_brief
+from mtl_bench.core.recipe import Count, Positive
 from mtl_bench.deploy import engines
 
 PROTOCOL = 1  # raised when times taken before stop being comparable with times taken after
@@ -30,26 +39,31 @@ SIZE = re.compile(r"([1-9]\d*)x([1-9]\d*)")
 
 
 @dataclass(frozen=True)
-class Timing:
+class Timing(Checked):
     """One network on one engine at one size: what `mtl-bench latency` measures at a time.
 
     Raises:
         ValueError: a size that is not HxW.
     """
 
-    backbone: str
-    engine: str
-    precision: str = "fp32"
-    size: str = "1024x2048"  # height x width of the image, pixels
-    tasks: tuple[str, ...] = Recipe.tasks
-    device: str = "cpu"  # cpu | cuda: the kind; its name stands in the row
-    passes: int = 500  # the paper's
-    seconds: float | None = None  # ends the passes early, as `mtl-bench latency --seconds` does
-    recipe: str = "paper"  # the network's sizes behind the backbone; "paper" is `Recipe()`
+    backbone: Annotated[str, plugins.IS_NAME, "its name, see `list backbones`"]
+    engine: Annotated[str, plugins.IS_NAME, "its name, see `list engines`"]
+    precision: Annotated[str, "fp32, or what the engine has beside it"] = "fp32"
+    size: Annotated[str, "height x width of the image, pixels"] = "1024x2048"
+    tasks: Annotated[
+        tuple[Annotated[str, plugins.IS_NAME], ...], SOME, DISTINCT, "whose heads are timed"
+    ] = Recipe.tasks
+    device: Annotated[str, one_of("cpu", "cuda"), "the kind; its name stands in the row"] = "cpu"
+    passes: Annotated[Count, "timed ones; the paper's are 500"] = 500
+    seconds: Annotated[Positive | None, "ends the passes early"] = None
+    recipe: Annotated[
+        str, "the network's sizes behind the backbone; paper: the defaults of all"
+    ] = "paper"
     weights: str | None = None  # folder of the run that trained them; None: random
     backbone_args: Mapping[str, Any] = field(default_factory=lambda: NOTHING)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not SIZE.fullmatch(self.size):
             raise ValueError(f"size '{self.size}' is not HxW, such as 1024x2048")
 
@@ -251,7 +265,7 @@ class Cells(Kind[Cell]):
         return float(sum(v for k, v in row.get("time", {}).items() if k.endswith("_s")))
 
     def check(self, jobs: Iterable[Cell]) -> None:
-        plugins.check_cells(jobs)
+        check_cells(jobs)
 
 
 class Timings(Kind[Timing]):
@@ -304,7 +318,7 @@ class Timings(Kind[Timing]):
                 plugins.path_of("tasks", task)
             plugins.path_of("backbones", timing.backbone)
             arguments = timing.backbone_args
-            known = plugins.settings("backbones", timing.backbone) if arguments else {}
+            known = plugins.arguments("backbones", timing.backbone) if arguments else {}
             for key in arguments.keys() - known.keys():
                 hint = did_you_mean(key, known)
                 raise ValueError(f"backbone '{timing.backbone}' has no '{key}'{hint}")

@@ -462,7 +462,7 @@ class Here:
                 return
             renewed = stale and store.can_renew(cell, self.runs)
             if not renewed:
-                self._begin(cell)
+                self._begin(cell, rerun)
             with _recorded(directory):
                 from mtl_bench.bench.run import renew, run_cell
 
@@ -472,11 +472,15 @@ class Here:
                     run_cell(cell, directory, self.root, self.device, self.wandb, self.echo)
         self.echo(f"{directory}/row.json")
 
-    def _begin(self, cell: Cell) -> None:
+    def _begin(self, cell: Cell, rerun: bool) -> None:
         state = store.stored(cell, self.runs)
         if state.word == "stale":
             self.echo(store.set_aside(store.run_dir(cell, self.runs), state.why))
         if line := store.begin(cell, self.runs)[1]:
+            self.echo(line)
+        from mtl_bench.bench.reuse import adopt
+
+        if not rerun and (line := adopt(cell, self.runs)):
             self.echo(line)
 
 
@@ -486,7 +490,7 @@ def _recorded(directory: Path) -> Iterator[None]:
     (directory / "failed.json").unlink(missing_ok=True)
     try:
         yield
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # the latter a plug-in's
         line = " ".join(f"{type(error).__name__}: {error}".split())
         store.write_failure(directory, line, traceback.format_exc())
         raise

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from mtl_bench.core.device import Compute, choose_device
 from mtl_bench.core.files import read_json, replacing, write_json
 from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.samples import open_samples
-from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, open_walks
+from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, open_walks, rehearse
 from mtl_bench.model import Model
 from mtl_bench.train.curve import data_share, training_time
 from mtl_bench.train.loop import CHECKPOINT, train
@@ -184,7 +185,8 @@ def _train(
     if compute.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(compute.device)
     given = (cell, root, run_dir, compute, progress, tracker)
-    model = train(*given, start=start, further_labels=further_labels)
+    rehearsal = partial(rehearse, cell=cell, root=root, device=compute.device)
+    model = train(*given, start=start, further_labels=further_labels, rehearse=rehearsal)
     taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(compute.device))
     write_json(run_dir / TAKEN, taken)
     train_s, step_ms = training_time(run_dir / "curve.csv")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mtl_bench.core.plugins import NAME, files
+from mtl_bench.core.plugins import NAME, NAMED, files
 
 METHOD = '''"""{title}: one line that `mtl-bench list` shows.
 
@@ -128,7 +128,7 @@ def write(kind: str, name: str, folder: Path | None = None) -> Path:
         ValueError: an impossible or taken name.
     """
     if not NAME.fullmatch(name):
-        raise ValueError(f"'{name}' is no name for a file: lower-case letters, digits and _")
+        raise ValueError(f"'{name}' {NAMED}")
     taken = files(kind).get(name)
     if taken is not None:
         raise ValueError(f"there is a {kind[:-1]} called '{name}': {taken}")

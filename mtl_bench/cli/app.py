@@ -24,6 +24,7 @@ TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
 # a training of two threads made it 80 times slower. Read when torch is loaded.
 SPIN = {"GOMP_SPINCOUNT": "1000", "KMP_BLOCKTIME": "1"}
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # no space, over quota, read-only
+NAMES = (errno.ENAMETOOLONG, errno.ELOOP)  # a path that is none
 USERS = (FileNotFoundError, PermissionError, NotADirectoryError, IsADirectoryError)
 
 
@@ -39,6 +40,9 @@ class Group(TyperGroup):
         except ClaimedError as error:
             typer.echo(f"mtl-bench: {error}", err=True)
             raise typer.Exit(CLAIMED) from None
+        except SystemExit as stop:  # commands end by `typer.Exit`
+            typer.echo(f"mtl-bench: a plug-in has called sys.exit({stop.code!r})", err=True)
+            raise typer.Exit(1) from None
         except (ValueError, OSError) as error:
             if isinstance(error, OSError) and not _is_users(error):
                 raise
@@ -86,7 +90,7 @@ def one_line(error: Exception) -> str:
 
 
 def _is_users(error: OSError) -> bool:
-    return isinstance(error, USERS) or error.errno in FULL
+    return isinstance(error, USERS) or error.errno in (*FULL, *NAMES)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:

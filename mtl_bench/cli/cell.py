@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from mtl_bench.cli import options as o
-from mtl_bench.core.config import GRANULARITIES, Cell, load_recipe, override
+from mtl_bench.core.config import GRANULARITIES, Cell, check_cells, load_recipe, override
 
 
 def register(app: typer.Typer) -> None:
@@ -118,7 +118,6 @@ def train(
         _time_again(cell, data, runs, device.value, quiet)
         return
     from mtl_bench.bench import launch, store
-    from mtl_bench.core.plugins import check_cells
 
     check_cells([cell])
     if not rerun and (line := store.done_already(cell, runs, stale)):

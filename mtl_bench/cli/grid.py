@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,6 +89,10 @@ def ablate(
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
     chosen.kind.check(chosen.jobs)
+    if chosen.kind is CELLS:
+        from mtl_bench.report import grid as of_cells
+
+        of_cells.check(chosen)
     todo = store.to_run(chosen.jobs, runs, rerun)
     for job in [] if dry_run else todo:
         if isinstance(job, Cell):
@@ -238,6 +243,7 @@ class Choice:
             settings=self.settings or [],
             pretrained=o.weights(self.pretrained),
             device=device.value,
+            say=partial(typer.echo, err=True),
         )
 
     @property

@@ -1,14 +1,17 @@
 """`list`, `new`, `check` and `env`: what there is, adding to it, and where it runs."""
 
+import json
 import textwrap
 from collections.abc import Sequence
+from dataclasses import MISSING
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from mtl_bench.cli import options as o
+from mtl_bench.core.plain import to_dict
 from mtl_bench.core.plugins import Description
 
 
@@ -21,6 +24,7 @@ class What(StrEnum):
     engines = "engines"
     recipes = "recipes"
     grids = "grids"
+    settings = "settings"
 
 
 class Kind(StrEnum):
@@ -47,12 +51,15 @@ def show(
     ] = False,
     plugins: o.PluginsOption = None,
 ) -> None:
-    """List methods, backbones, tasks, data sets, engines, recipes and grids; imports none."""
+    """List methods, backbones, tasks, data sets, engines, recipes and grids; imports none.
+
+    settings: every key that --set takes, its type and bounds, its default and what it means.
+    """
     if markdown:
         typer.echo(_page(what), nl=False)
         return
     for kind in What if what is What.all else [what]:
-        if kind is What.all:
+        if kind is What.all or (kind is What.settings and what is What.all):
             continue
         if what is What.all:
             typer.echo(f"{kind.value}")
@@ -65,6 +72,8 @@ def _lines(kind: str, verbose: bool) -> list[str]:
     from mtl_bench.core import cards, config
     from mtl_bench.core.plugins import describe
 
+    if kind == "settings":
+        return _settings()
     if kind == "recipes":
         return o.columns([[name, config.load_recipe(name).about] for name in config.recipe_names()])
     if kind == "grids":
@@ -83,6 +92,53 @@ def _lines(kind: str, verbose: bool) -> list[str]:
             [[name, error] for name, error in broken.items()]
         )
     return o.columns([[about.name, broken.get(about.name, about.summary)] for about in described])
+
+
+def _settings() -> list[str]:
+    """Every key that `--set` takes: of cells, of their plug-ins, of timings."""
+    from mtl_bench.bench.jobs import Timing
+    from mtl_bench.core import plugins
+    from mtl_bench.core.config import Cell
+    from mtl_bench.core.plain import name_of_type, settings_of
+
+    def of(kind: type[Any]) -> list[list[str]]:
+        return [
+            [s.key, ", ".join(filter(None, (s.kind, s.rules))), _text(s.default), s.about]
+            for s in settings_of(kind)
+        ]
+
+    head = ["key", "type", "default", ""]
+    own = {
+        word: {name: plugins.arguments(f"{word}s", name) for name in plugins.readable(f"{word}s")}
+        for word in ("method", "backbone")
+    }
+    parts = {
+        "of a cell; a recipe's own values are in its file": of(Cell),
+        "of a cell's method and backbone; of a method a+b: method.a.KEY": [
+            [
+                f"{word}.{key}",
+                name_of_type(found.kind),
+                _text(found.default),
+                f"{name}: {found.about}",
+            ]
+            for word, plug_ins in own.items()
+            for name, arguments in plug_ins.items()
+            for key, found in arguments.items()
+        ],
+        "of a grid of timings; and backbone.KEY, weights.BACKBONE (a folder in runs/), "
+        "quality.recipe": of(Timing),
+    }
+    lines = []
+    for title, rows in parts.items():
+        lines += [title, *o.columns([head, *rows]), ""]
+    return lines[:-1]
+
+
+def _text(default: Any) -> str:
+    """A default as `--set` takes it; empty where there is none."""
+    if default in (MISSING, ...) or isinstance(default, str):
+        return default if isinstance(default, str) else ""
+    return "none" if default is None else json.dumps(to_dict(default))
 
 
 def _engine(about: Description) -> list[str]:

@@ -97,7 +97,8 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Change a value: recipe.optim.lr=3e-4, method.init=0.5. Repeatable.",
+        help="Change a value: recipe.optim.lr=3e-4, method.init=0.5; `list settings` has them all. "
+        "Repeatable.",
         show_default=False,
     ),
 ]

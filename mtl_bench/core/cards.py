@@ -13,7 +13,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from mtl_bench.core import plugins
-from mtl_bench.core.fingerprint import ancestry, forget_edited, load, of_package
+from mtl_bench.core.fingerprint import forget_edited
 from mtl_bench.core.plain import in_markdown
 from mtl_bench.core.plugins import Description
 
@@ -22,7 +22,6 @@ PREPRINT = re.compile(r"\barXiv:(\d{4}\.\d{4,5})")
 ADDRESS = re.compile(r"\b(?:https?://)?((?:[a-z]+\.)+[a-z]{2,}/[^\s,;)]+)")
 HEADING = re.compile(r"^(?:Args|Raises):$", re.MULTILINE)
 
-CONTRACT = of_package("core.method"), "Method"
 LEGEND = (
     "Cost of a step: F forward pass, B ordinary backward pass. Of each of K losses, H is the "
     "backward pass through its decoder, T the one through the shared encoder."
@@ -49,7 +48,7 @@ def cards() -> list[Card]:
 
 
 def _card(about: Description) -> Card:
-    line = [] if about.error else _line_in(about.path)
+    line = [] if about.error else plugins.lineage("methods", about.path)
     if not line:
         return Card(about)
     source = _source(about.doc)
@@ -63,14 +62,8 @@ def _card(about: Description) -> Card:
         needs=str(_declared(line).get("needs", "")),
         extras=tuple(_extras(line)),
         cost=_cost(line),
-        settings=_settings(line),
+        settings={k: argument.text for k, argument in plugins.arguments_of(line).items()},
     )
-
-
-def _line_in(path: Path) -> list[ast.ClassDef]:
-    """The file's method, its base, the base's base, ...; empty if no class leads to `Method`."""
-    lines = (ancestry(path, name) for name in load(path).statements)
-    return next((list(line.values()) for line in lines if CONTRACT in [*line][1:]), [])
 
 
 def _source(doc: str) -> str:
@@ -101,12 +94,6 @@ def _declared(line: Sequence[ast.ClassDef]) -> dict[str, object]:
     return values
 
 
-def _definitions(line: Sequence[ast.ClassDef], name: str) -> list[ast.FunctionDef]:
-    """Of a function, the nearest first."""
-    items = [item for node in line for item in node.body]
-    return [item for item in items if isinstance(item, ast.FunctionDef) and item.name == name]
-
-
 def _is_a(line: Sequence[ast.ClassDef], base: str) -> bool:
     return base in [node.name for node in line]
 
@@ -135,22 +122,6 @@ def _cost(line: Sequence[ast.ClassDef]) -> str:
     if values.get("needs") == "representation":
         return f"{batches}F + {each}KH + {batches}T"
     return f"{batches}F + {each}K(H + T)"
-
-
-def _settings(line: Sequence[ast.ClassDef]) -> dict[str, str]:
-    """Arguments of the constructor that the harness leaves alone."""
-    arguments = _definitions(line, "__init__")[0].args
-    plain = [*arguments.posonlyargs, *arguments.args]
-    plain = plain[len(plain) - len(arguments.defaults) :]  # all but `self` and `terms` have one
-    pairs = [
-        *zip(plain, arguments.defaults, strict=True),
-        *zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True),
-    ]
-    return {
-        argument.arg: ast.unparse(default)
-        for argument, default in pairs
-        if default is not None and argument.arg not in plugins.GIVEN
-    }
 
 
 # --- text -----------------------------------------------------------------------------------------

@@ -10,12 +10,22 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
-from mtl_bench.core.plain import did_you_mean, from_dict, to_dict
+from mtl_bench.core import plugins, toml_file
+from mtl_bench.core.plain import (
+    DISTINCT,
+    Checked,
+    convert,
+    did_you_mean,
+    from_dict,
+    one_of,
+    to_dict,
+)
+from mtl_bench.core.plugins import IS_NAME
 from mtl_bench.core.recipe import (
     Augment,
     Data,
@@ -26,11 +36,20 @@ from mtl_bench.core.recipe import (
     Optim,
     PseudoLabels,
     Recipe,
+    Whole,
 )
 
 __all__ = ["Augment", "Data", "Evaluate", "Latency", "Loss", "Network", "Optim", "PseudoLabels"]
-__all__ += ["Cell", "Recipe", "canonical_json", "load_recipe", "override", "recipe_names"]
-__all__ += ["did_you_mean", "from_dict", "set_values", "to_dict"]
+__all__ += [
+    "Cell",
+    "Recipe",
+    "canonical_json",
+    "check_cells",
+    "load_recipe",
+    "override",
+    "training_json",
+]
+__all__ += ["did_you_mean", "from_dict", "recipe_names", "set_values", "to_dict"]
 
 PROTOCOL = 2  # raised when numbers made before stop being comparable with numbers made after
 RECIPES = Path(__file__).parents[1] / "bench" / "recipes"
@@ -45,9 +64,17 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("evaluate", "flip"),
 )
 
+NOT_SET = {
+    "recipe.tasks": "a cell has its own, tasks",
+    "recipe.name": "a recipe is called as its file",
+    "recipe.about": "it is said in the recipe's file",
+    "method_args": "its settings are method.KEY",
+    "backbone_args": "its settings are backbone.KEY",
+}
+
 
 @dataclass(frozen=True)
-class Cell:
+class Cell(Checked):
     """One training run and its evaluation.
 
     Two kinds of cell need others (their `parents`) first: `video` trains its parent's checkpoint
@@ -55,27 +82,34 @@ class Cell:
     networks of its parents together.
 
     Raises:
-        ValueError: an unknown granularity, or options that exclude each other.
+        ValueError: a value that its field cannot have, or options that exclude each other.
     """
 
     recipe: Recipe
-    backbone: str
-    method: str  # a name, or a loss-value method and a gradient method: a+b
-    tasks: tuple[str, ...] = ()  # none named: the recipe's
-    seed: int = 0
-    video: bool = False  # the second training, on pseudo-labeled frames too
-    single_task: bool = False  # one network a task, each trained alone
-    granularity: str = "terms"  # what a method weighs: the loss terms, or tasks of fixed weights
-    pretrained: str | None = None  # initial weights: None = random | "timm" | a file
+    backbone: Annotated[str, IS_NAME, "its name, see `list backbones`"]
+    method: Annotated[str, IS_NAME, "a name, or a loss-value method and a gradient method: a+b"]
+    tasks: Annotated[
+        tuple[Annotated[str, IS_NAME], ...], DISTINCT, "names; none: the recipe's"
+    ] = ()
+    seed: Annotated[Whole, "of initial weights, data order and method"] = 0
+    video: Annotated[bool, "the second training, on pseudo-labeled frames too"] = False
+    single_task: Annotated[bool, "one network a task, each trained alone"] = False
+    granularity: Annotated[
+        str, one_of(*GRANULARITIES), "what a method weighs: terms, or tasks as sums of them"
+    ] = "terms"
+    pretrained: Annotated[
+        str | None, "initial weights: timm, or a file; without it they are random"
+    ] = None
     method_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     backbone_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.tasks:
             object.__setattr__(self, "tasks", self.recipe.tasks)
-        if self.granularity not in GRANULARITIES:
-            known = did_you_mean(self.granularity, GRANULARITIES)
-            raise ValueError(f"no granularity '{self.granularity}'{known}")
+        object.__setattr__(self, "method_args", _method_args(self.method, self.method_args))
+        arguments = _args("backbones", self.backbone, self.backbone_args, "backbone")
+        object.__setattr__(self, "backbone_args", arguments)
         if self.single_task and self.video:
             raise ValueError(
                 "single_task and video exclude each other: the stage needs one network"
@@ -90,7 +124,7 @@ class Cell:
             return tuple(replace(self, single_task=False, tasks=(task,)) for task in self.tasks)
         return (replace(self, video=False),) if self.video else ()
 
-    @property
+    @cached_property
     def id(self) -> str:
         """12 hexadecimal digits of the canonical JSON: recipe values, not the recipe's name."""
         return hashlib.sha256(canonical_json(self).encode()).hexdigest()[:12]
@@ -104,7 +138,7 @@ class Cell:
     def label(self) -> str:
         """What a reader tells cells of one grid apart by, in a few words."""
         words = [self.method, self.backbone, f"s{self.seed}"]
-        words += [] if self.tasks == self.recipe.tasks else [",".join(self.tasks)]
+        words += [] if set(self.tasks) == set(self.recipe.tasks) else [",".join(self.tasks)]
         words += ["single-task"] * self.single_task + ["video"] * self.video
         words += [] if self.granularity == "terms" else [f"by {self.granularity}"]
         arguments = [*self.method_args.items(), *self.backbone_args.items()]
@@ -112,6 +146,36 @@ class Cell:
 
 
 # --- identity -----------------------------------------------------------------------------------
+
+
+def _method_args(method: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Of `a+b`, settings come by part."""
+    names = plugins.part_names(method)
+    if len(names) == 1:
+        return _args("methods", method, values, "method")
+    found = {
+        part: _args("methods", part, inner, f"method.{part}")
+        if part in names and isinstance(inner, Mapping)
+        else inner
+        for part, inner in values.items()
+    }
+    return MappingProxyType({p: inner for p, inner in found.items() if inner or p not in names})
+
+
+def _args(kind: str, name: str, values: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+    """A plug-in's settings in one spelling: of the types of its constructor, without defaults."""
+    if not values:
+        return values
+    try:
+        known = plugins.arguments(kind, name)
+    except ValueError:
+        return values  # `check_cells` tells what is wrong with the plug-in
+    found = {
+        key: convert(known[key].kind, value, f"{where}.{key}") if key in known else value
+        for key, value in values.items()
+    }
+    given = {k: v for k, v in found.items() if k not in known or v != known[k].default}
+    return MappingProxyType(given)
 
 
 def canonical_json(cell: Cell) -> str:
@@ -126,12 +190,24 @@ def canonical_json(cell: Cell) -> str:
     for key in ("cache", "workers"):
         del values["recipe"]["data"][key]
     defaults = to_dict(Recipe())
+    values["tasks"] = sorted(cell.tasks, reverse=True)  # no order changes a number
+    values["recipe"]["data"]["dataset"] = cell.recipe.data.dataset.replace("_", "-")
     for section, key in LATER:
         if values["recipe"][section][key] == defaults[section][key]:
             del values["recipe"][section][key]
     if cell.pretrained not in (None, "timm"):
         values["pretrained"] = _content_hash(Path(str(cell.pretrained)))
     return json.dumps({"protocol": PROTOCOL, **values}, sort_keys=True, separators=(",", ":"))
+
+
+def training_json(cell: Cell) -> str:
+    """What makes a cell's training: the same without what only comes after it.
+
+    The video stage's labels are made with the evaluation's post-processing.
+    """
+    recipe = replace(cell.recipe, latency=Latency())
+    recipe = recipe if cell.video else replace(recipe, evaluate=Evaluate())
+    return canonical_json(replace(cell, recipe=recipe))
 
 
 @lru_cache
@@ -159,8 +235,8 @@ def load_recipe(name: str) -> Recipe:
     path = Path(name) if name.endswith(".toml") else RECIPES / f"{name}.toml"
     if not path.is_file():
         raise ValueError(f"no recipe called '{name}'{did_you_mean(name, recipe_names())}")
+    values = toml_file.read(path).values
     try:
-        values = tomllib.loads(path.read_text())
         return from_dict(Recipe, {"name": path.stem, **values})
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -195,8 +271,12 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
 
 def set_values(cell: Cell, settings: Mapping[str, Any]) -> Cell:
     """As `override`, with values as they are; below `method.` and `backbone.` sections are made."""
+    if not settings:
+        return cell
     values = to_dict(cell)
     for key, value in settings.items():
+        if key in NOT_SET:
+            raise ValueError(f"'{key}' cannot be set: {NOT_SET[key]}")
         *sections, last = key.split(".")
         plug_in = sections[:1] in (["method"], ["backbone"])  # checked when it is constructed
         if plug_in:
@@ -211,3 +291,48 @@ def set_values(cell: Cell, settings: Mapping[str, Any]) -> Cell:
             raise ValueError(f"unknown key '{key}'{did_you_mean(last, target)}")
         target[last] = to_dict(value)
     return from_dict(Cell, values)
+
+
+# --- checks ------------------------------------------------------------------------------------
+
+
+def check_cells(cells: Iterable[Cell]) -> None:
+    """What cells name exists: tasks, plug-ins and the hyper-parameters that are set.
+
+    Raises:
+        ValueError: an unknown task, plug-in or hyper-parameter, with the nearest known one.
+    """
+    seen: set[tuple[str, str, tuple[str, ...]]] = set()
+    for cell in cells:
+        declared = [plugins.attributes("tasks", task) for task in cell.tasks]
+        if cell.video and not any(found.get("makes_labels") for found in declared):
+            raise ValueError(f"video needs a task that makes labels, not {', '.join(cell.tasks)}")
+        for kind, name, values in _chosen(cell):
+            if (kind, name, tuple(values)) in seen:
+                continue
+            seen.add((kind, name, tuple(values)))
+            plugins.path_of(kind, name)
+            known = plugins.arguments(kind, name) if values else {}
+            for key in values:
+                if key not in known:
+                    word = kind[:-1]
+                    raise ValueError(f"{word} '{name}' has no '{key}'{did_you_mean(key, known)}")
+
+
+def _chosen(cell: Cell) -> list[tuple[str, str, Mapping[str, Any]]]:
+    """Kind, name and settings of a cell's plug-ins; of `a+b`, settings come by part."""
+    names = plugins.part_names(cell.method)
+    parts = {names[0]: cell.method_args} if len(names) == 1 else dict(cell.method_args)
+    for name in parts:
+        if name not in names:
+            raise ValueError(
+                f"method '{cell.method}' has no part '{name}': --set method.{names[0]}.KEY=VALUE"
+            )
+    methods = [("methods", name, parts.get(name, {})) for name in names]
+    dataset = cell.recipe.data.dataset.replace("-", "_")
+    return [
+        *methods,
+        ("backbones", cell.backbone, cell.backbone_args),
+        *(("tasks", task, {}) for task in cell.tasks),
+        ("datasets", dataset, {}),
+    ]

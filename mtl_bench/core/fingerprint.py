@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -201,13 +202,31 @@ def _definitions(target: Target) -> Iterator[tuple[Path, str]]:
             yield from _definitions(Target(other, target.name))
 
 
+def with_helpers(path: Path) -> list[Path]:
+    """A file and those outside of this package that it imports, directly or through another.
+
+    Raises:
+        ValueError: a file that is no Python.
+    """
+    found, left = {path}, [path]
+    while left:
+        path = left.pop()
+        every = [imported(node, path).values() for node in load(path).importing]
+        targets = [(t.path, t.name) for t in chain.from_iterable(every) if t.path is not None]
+        beside = {file for file, _ in targets} | {_submodule(f, n) for f, n in targets if n}
+        new = {p for p in beside - found if p is not None and p.is_file() and not ours(p)}
+        found |= new
+        left += new
+    return sorted(found)
+
+
 # --- files ----------------------------------------------------------------------------------------
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
     try:
         status = path.stat()
-    except FileNotFoundError:
+    except OSError:  # gone, or a link that leads nowhere
         return None
     return status.st_mtime_ns, status.st_size
 
@@ -239,6 +258,20 @@ def _submodule(path: Path, name: str) -> Path | None:
     return _module_file(path.parent / name) if path.stem == "__init__" else None
 
 
+def content(path: Path) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        ValueError: what has this name is no file that can be read, such as a link to nowhere.
+    """
+    if not path.is_file():
+        raise ValueError(f"no file to read: {path}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"no file to read, {error.strerror}: {path}") from None
+
+
 class Module:
     """A file's top level: what it defines, imports and does."""
 
@@ -250,10 +283,14 @@ class Module:
         self.effects: list[ast.stmt] = []  # what runs on import and defines nothing
         self._codes: dict[tuple[str, str], Code] = {}
         self._stages: dict[str, dict[str, set[str]] | None] = {}
+        text = content(path)
         try:
-            tree = ast.parse(path.read_bytes(), str(path))
+            tree = ast.parse(text, str(path))
         except (SyntaxError, ValueError) as error:  # ValueError: null bytes
-            raise ValueError(f"{path}: {type(error).__name__}: {error.args[0]}") from None
+            line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+            raise ValueError(f"{path}{line}: {type(error).__name__}: {error.args[0]}") from None
+        statements = (ast.Import, ast.ImportFrom)
+        self.importing = [node for node in ast.walk(tree) if isinstance(node, statements)]
         for statement in tree.body:
             self._see(statement)
 
@@ -586,7 +623,10 @@ class _Normal:
                 return scope[name]
         if name in self.module.statements:
             return Target(self.module.path, name)
-        return self.module.imports.get(name)
+        if name in self.module.imports:
+            return self.module.imports[name]
+        starred = (Target(path, name) for path in self.module.stars)
+        return next((target for target in starred if any(_definitions(target))), None)
 
 
 def _sha(*texts: str) -> str:

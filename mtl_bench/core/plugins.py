@@ -22,14 +22,14 @@ import re
 import sys
 import traceback
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from mtl_bench.core.config import Cell, did_you_mean
-from mtl_bench.core.fingerprint import ancestry, of_package
+from mtl_bench.core.fingerprint import ancestry, content, forget_edited, of_package, with_helpers
 from mtl_bench.core.fingerprint import load as load_text
+from mtl_bench.core.plain import Rule, did_you_mean
 
 PACKAGE = Path(__file__).resolve().parents[1]
 VARIABLE = "MTL_BENCH_PLUGINS"  # what --plugins adds to; the processes that run cells inherit it
@@ -47,7 +47,14 @@ SHIPPED = {  # in the package; the others have a folder of their own beside it
     "engines": PACKAGE / "deploy" / "engines",
 }
 GIVEN = ("self", "terms", "seed", "strides", "pretrained")  # the harness fills these arguments in
-NAME = re.compile(r"[a-z][a-z0-9_]*")
+NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders are called by it
+NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
+IS_NAME = Rule(
+    "a name of a-z, 0-9 and _",
+    lambda value: all(NAME.fullmatch(part) for part in part_names(value) if value),
+)
+TOLD = re.compile(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", re.MULTILINE)  # in a section Args
+PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ def path_of(kind: str, name: str) -> Path:
     """The file of a plug-in.
 
     Raises:
-        ValueError: an unknown name, or one that two files have.
+        ValueError: an unknown name, one that two files have, or what is no name.
     """
     word, paths = kind[:-1], _candidates(kind).get(name)
     if paths is None:
@@ -107,6 +114,8 @@ def path_of(kind: str, name: str) -> Path:
         )
     if len(paths) > 1:
         raise ValueError(f"two {kind} are called '{name}': {paths[0]} and {paths[1]}; rename one")
+    if not NAME.fullmatch(name):
+        raise ValueError(f"'{name}' {NAMED}; rename {paths[0]}")
     return paths[0]
 
 
@@ -120,7 +129,7 @@ def _candidates(kind: str) -> dict[str, list[Path]]:
     paths = [path for folder in folders(kind) for path in _files_in(folder)]
     extra = (Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep))
     paths += [path for path in extra if path.is_file()]
-    for path in dict.fromkeys(path.resolve() for path in paths):
+    for path in dict.fromkeys(path.resolve() if path.is_file() else path for path in paths):
         if _kind_of(path) == kind:
             found.setdefault(name_of(path), []).append(path)
     return dict(sorted(found.items()))
@@ -140,9 +149,14 @@ def _kind_of(path: Path) -> str | None:
     folder = path.parent.parent if path.stem == "__init__" else path.parent
     for kind, place in SHIPPED.items():
         if folder == place:  # other modules lie beside the plug-ins
-            return kind if _derives(path, kind) else None
+            try:
+                return kind if _derives(path, kind) else None
+            except ValueError:  # listed as broken
+                return kind
     if folder.name in KINDS:
         return folder.name
+    if not path.is_file():  # a link that leads nowhere
+        return None
     text = path.read_text(encoding="utf-8", errors="replace")
     for kind, (module, base) in BASES.items():
         package, _, last = module.rpartition(".")
@@ -157,10 +171,20 @@ def _kind_of(path: Path) -> str | None:
 @functools.cache
 def _derives(path: Path, kind: str) -> bool:
     """Whether a file of this package defines a class that descends from a kind's contract."""
+    return bool(lineage(kind, path))
+
+
+def lineage(kind: str, path: Path) -> list[ast.ClassDef]:
+    """A file's plug-in class, its base, the base's base, ...; empty if none leads to the contract.
+
+    Raises:
+        ValueError: a file that is no Python.
+    """
     module, base = BASES[kind]
     contract = of_package(module.removeprefix("mtl_bench.")), base
-    public = (name for name in load_text(path).statements if not name.startswith("_"))
-    return any(contract in ancestry(path, name) for name in public)
+    public = [name for name in load_text(path).statements if not name.startswith("_")]
+    lines = (ancestry(path, name) for name in public)
+    return next((list(line.values()) for line in lines if contract in [*line][1:]), [])
 
 
 @functools.cache
@@ -179,8 +203,8 @@ def describe(kind: str) -> list[Description]:
 def _describe(name: str, paths: list[Path]) -> Description:
     path = paths[0]
     try:
-        tree = ast.parse(path.read_bytes(), str(path))
-    except (SyntaxError, ValueError) as error:  # ValueError: null bytes
+        tree = _parse(content(path))
+    except (SyntaxError, ValueError) as error:  # ValueError: null bytes, or no file
         line = f" (line {error.lineno})" if isinstance(error, SyntaxError) else ""
         return Description(name, "", path, f"{type(error).__name__}: {error.args[0]}{line}")
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
@@ -190,7 +214,7 @@ def _describe(name: str, paths: list[Path]) -> Description:
     if len(paths) > 1:
         wrong = f"two files have this name: {paths[0]} and {paths[1]}"
     elif not NAME.fullmatch(name):
-        wrong = f"'{name}' is no name: lower-case letters, digits and _"
+        wrong = f"'{name}' {NAMED}"
     elif not classes:
         wrong = "defines no class"
     elif missing:
@@ -219,7 +243,7 @@ def attributes(kind: str, name: str) -> dict[str, Any]:
     Raises:
         ValueError: an unknown or ambiguous name.
     """
-    return dict(_attributes(path_of(kind, name).read_bytes()))
+    return dict(_attributes(content(path_of(kind, name))))
 
 
 @functools.cache
@@ -235,8 +259,8 @@ def readable(kind: str) -> list[str]:
     """Names whose attributes can be read: of one file, which is Python."""
     found = []
     for name, paths in _candidates(kind).items():
-        with contextlib.suppress(SyntaxError, ValueError):  # ValueError: null bytes
-            _parse(paths[0].read_bytes())
+        with contextlib.suppress(SyntaxError, ValueError):  # ValueError: null bytes, or no file
+            _parse(content(paths[0]))
             found += [name] * (len(paths) == 1)
     return found
 
@@ -344,7 +368,7 @@ def load(kind: str, name: str) -> type[Any]:
     importlib.invalidate_caches()
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         line = next(
             (
                 f", line {f.lineno}"
@@ -379,70 +403,89 @@ def part_names(method: str) -> list[str]:
 
 def fingerprint(kind: str, name: str) -> str:
     """12 hexadecimal digits of the file (or of both files of `a+b`) and the helpers it imports."""
+    forget_edited()
     digest = hashlib.sha256()
     for part in part_names(name):
-        for path in _with_helpers(path_of(kind, part)):
+        for path in with_helpers(path_of(kind, part)):
             digest.update(path.read_bytes().replace(b"\r\n", b"\n") + b"\0")
     return digest.hexdigest()[:12]
 
 
-def _with_helpers(path: Path) -> list[Path]:
-    """A file and the `_*.py` beside it that it imports, directly or through another."""
-    found, left = {path}, [path]
-    while left:
-        for helper in re.findall(r"^\s*from \.(\w+) import", left.pop().read_text(), re.MULTILINE):
-            beside = path.with_name(f"{helper}.py")
-            if beside.is_file() and beside not in found:
-                found.add(beside)
-                left.append(beside)
-    return sorted(found)
+class Argument(NamedTuple):
+    """An argument of a plug-in's constructor that is its user's to set."""
+
+    kind: Any  # its type, as `plain.convert` takes it; Any where the file says none that is known
+    text: str  # its default, as it is written
+    default: Any  # its value; ... where it is no literal
+    about: str = ""  # what the class's docstring says of it
 
 
-def settings(kind: str, name: str) -> dict[str, Any]:
-    """Hyper-parameters -> defaults: the constructor's arguments that the harness leaves alone."""
-    parameters = inspect.signature(load(kind, name).__init__).parameters.values()
-    return {p.name: p.default for p in parameters if p.name not in GIVEN}
-
-
-def check_cells(cells: Iterable[Cell]) -> None:
-    """What cells name exists: tasks, plug-ins and the hyper-parameters that are set.
+def arguments(kind: str, name: str) -> dict[str, Argument]:
+    """Hyper-parameters: the constructor's arguments that the harness leaves alone, by name.
 
     Raises:
-        ValueError: an unknown task, plug-in or hyper-parameter, with the nearest known one.
+        ValueError: an unknown or ambiguous plug-in, or one that is no Python.
     """
-    seen: set[tuple[str, str, tuple[str, ...]]] = set()
-    for cell in cells:
-        if len(set(cell.tasks)) < len(cell.tasks):
-            raise ValueError(f"a task is named twice: {', '.join(cell.tasks)}")
-        declared = [attributes("tasks", task) for task in cell.tasks]
-        if cell.video and not any(found.get("makes_labels") for found in declared):
-            raise ValueError(f"video needs a task that makes labels, not {', '.join(cell.tasks)}")
-        for kind, name, values in _chosen(cell):
-            if (kind, name, tuple(values)) in seen:
-                continue
-            seen.add((kind, name, tuple(values)))
-            path_of(kind, name)
-            known = settings(kind, name) if values else {}  # importing torch takes seconds
-            for key in values:
-                if key not in known:
-                    word = kind[:-1]
-                    raise ValueError(f"{word} '{name}' has no '{key}'{did_you_mean(key, known)}")
+    path = path_of(kind, name)
+    forget_edited()
+    return arguments_of(lineage(kind, path))
 
 
-def _chosen(cell: Cell) -> list[tuple[str, str, Mapping[str, Any]]]:
-    """Kind, name and settings of a cell's plug-ins; of `a+b`, settings come by part."""
-    names = part_names(cell.method)
-    parts = {names[0]: cell.method_args} if len(names) == 1 else dict(cell.method_args)
-    for name in parts:
-        if name not in names:
-            raise ValueError(
-                f"method '{cell.method}' has no part '{name}': --set method.{names[0]}.KEY=VALUE"
-            )
-    methods = [("methods", name, parts.get(name, {})) for name in names]
-    dataset = cell.recipe.data.dataset.replace("-", "_")
-    return [
-        *methods,
-        ("backbones", cell.backbone, cell.backbone_args),
-        *(("tasks", task, {}) for task in cell.tasks),
-        ("datasets", dataset, {}),
-    ]
+def arguments_of(line: Sequence[ast.ClassDef]) -> dict[str, Argument]:
+    """Of a class and its bases, the nearest first: those of the nearest constructor."""
+    items = (item for node in line for item in node.body if isinstance(item, ast.FunctionDef))
+    for item in items:
+        if item.name == "__init__":
+            break
+    else:
+        return {}
+    plain, keywords = [*item.args.posonlyargs, *item.args.args], item.args.kwonlyargs
+    defaults = [*[None] * (len(plain) - len(item.args.defaults)), *item.args.defaults]
+    pairs = zip([*plain, *keywords], [*defaults, *item.args.kw_defaults], strict=True)
+    told = _told(line)
+    return {
+        found.arg: _argument(found.annotation, default)._replace(about=told.get(found.arg, ""))
+        for found, default in pairs
+        if found.arg not in GIVEN
+    }
+
+
+def _told(line: Sequence[ast.ClassDef]) -> dict[str, str]:
+    """Argument -> what the section Args of its class's docstring says; `a, b: ...` is of both."""
+    found: dict[str, str] = {}
+    for node in line:
+        section = (ast.get_docstring(node) or "").partition("\nArgs:\n")[2]
+        for names, text in TOLD.findall(section):
+            found |= {name: " ".join(text.split()) for name in names.split(", ")} | found
+    return found
+
+
+def _argument(annotation: ast.expr | None, written: ast.expr | None) -> Argument:
+    default: Any = ...
+    inner = written
+    if isinstance(written, ast.Call) and ast.unparse(written.func) == "MappingProxyType":
+        inner = written.args[0]
+    with contextlib.suppress(ValueError):  # not a literal
+        default = ... if inner is None else ast.literal_eval(inner)
+    of = type(default) if type(default) in PLAIN.values() else Any
+    kind = of if annotation is None else _type(annotation)
+    return Argument(kind, "" if written is None else ast.unparse(written), default)
+
+
+def _type(node: ast.expr) -> Any:
+    """What an annotation stands for; Any where that is no type of plain values."""
+    match node:
+        case ast.Name(id=name):
+            return PLAIN.get(name, Any)
+        case ast.Constant(value=None):
+            return None
+        case ast.BinOp(left=left, op=ast.BitOr(), right=right):
+            sides = _type(left), _type(right)
+            return Any if Any in sides else sides[0] | sides[1]
+        case ast.Subscript(value=ast.Name(id="tuple"), slice=ast.Tuple(elts=inner)):
+            if isinstance(inner[-1], ast.Constant):  # ...
+                return tuple[_type(inner[0]), ...]  # type: ignore[misc]
+            return tuple[tuple(map(_type, inner))]  # type: ignore[misc]
+        case ast.Subscript(value=ast.Name(id="Mapping"), slice=ast.Tuple(elts=[_, value])):
+            return Mapping[str, _type(value)]  # type: ignore[misc]
+    return Any

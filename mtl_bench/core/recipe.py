@@ -1,133 +1,202 @@
 """A recipe: everything about training that is not the method, the backbone or the seed.
 
-Frozen dataclasses with the paper's values as defaults; `recipes/*.toml` name what differs.
+Frozen dataclasses with the paper's values as defaults; `recipes/*.toml` name what differs. The
+type of a field says what it may hold and what it means: see `core/plain.py`.
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated
+
+from mtl_bench.core.plain import (
+    ASCENDING,
+    DISTINCT,
+    FINITE,
+    ODD,
+    SOME,
+    Checked,
+    above,
+    least,
+    most,
+    one_of,
+)
+
+Count = Annotated[int, least(1)]
+Whole = Annotated[int, least(0)]
+Positive = Annotated[float, above(0), FINITE]
+NotNegative = Annotated[float, least(0), FINITE]
+Share = Annotated[float, least(0), most(1)]
 
 
 @dataclass(frozen=True)
-class Data:
+class Data(Checked):
     """The images. "synthetic..." is rendered on first use; any other is found by --data."""
 
-    dataset: str = "synthetic"  # synthetic | cityscapes | synthetic-kitti | kitti
-    height: int = 64  # network input, pixels; synthetic scenes are rendered at this size
-    width: int = 128
-    train_scenes: int = 800  # synthetic only
-    val_scenes: int = 100  # synthetic only
-    test_scenes: int = 8  # synthetic only
-    frames: int = 3  # synthetic only: length of a snippet; the video stage needs 4 or more
-    seed: int = 0  # synthetic only: which world
-    train_frames: str = "published"  # KITTI only: published (the split's) | all (with neighbours)
-    cache: bool = True  # keep decoded frames in memory
-    workers: int = 0  # data-loading processes; 0 = in the training process
+    dataset: Annotated[str, "which data set, see `list datasets`"] = "synthetic"
+    height: Annotated[
+        Count, "pixels of the network's input; synthetic scenes are rendered at this size"
+    ] = 64
+    width: Annotated[Count, "as height"] = 128
+    train_scenes: Annotated[Count, "synthetic only: scenes of the split train"] = 800
+    val_scenes: Annotated[Whole, "synthetic only: scenes of the split val"] = 100
+    test_scenes: Annotated[Whole, "synthetic only: scenes of the split test"] = 8
+    frames: Annotated[
+        Count, "synthetic only: length of a snippet; the video stage needs 4 or more"
+    ] = 3
+    seed: Annotated[Whole, "synthetic only: which world"] = 0
+    train_frames: Annotated[
+        str,
+        one_of("published", "all"),
+        "KITTI only: the split's frames, or all that have both neighbours",
+    ] = "published"
+    cache: Annotated[bool, "keep decoded frames in memory"] = True
+    workers: Annotated[Whole, "processes that load data; 0: the training process does"] = 0
 
 
 @dataclass(frozen=True)
-class Augment:
+class Augment(Checked):
     """Random changes of a training sample, the same for its three frames."""
 
-    flip: bool = True
-    scales: tuple[float, ...] = (1.0,)  # resize factors, one drawn per sample
-    crop: tuple[int, int] | None = None  # height, width after the resize; smaller images are padded
-    brightness: float = 0.2
-    contrast: float = 0.2
-    saturation: float = 0.2
-    hue: float = 0.05
+    flip: Annotated[bool, "mirror half of the samples"] = True
+    scales: Annotated[tuple[Positive, ...], SOME, "resize factors, one drawn a sample"] = (1.0,)
+    crop: Annotated[
+        tuple[Count, Count] | None, "height, width after the resize; smaller images are padded"
+    ] = None
+    brightness: Annotated[Share, "factors are drawn from 1 +- this"] = 0.2
+    contrast: Annotated[Share, "as brightness"] = 0.2
+    saturation: Annotated[Share, "as brightness"] = 0.2
+    hue: Annotated[float, least(0), most(0.5), "turns of the colour circle, from +- this"] = 0.05
 
 
 @dataclass(frozen=True)
-class Network:
+class Network(Checked):
     """Sizes of everything behind the backbone; the defaults are the paper's."""
 
-    strides: tuple[int, int, int] = (8, 16, 32)  # pyramid levels that the decoders read
-    channels: int = 128  # ARM, refinement and GCM
-    fused: int = 256  # FFM output
-    head: int = 256  # hidden width of a head
-    pose: str = "resnet18"  # pose encoder: resnet18 (the paper's) | light
-    pose_channels: int = 256
-    pose_scale: tuple[float, float] = (0.01, 0.01)  # of translation, rotation
-    min_depth: float = 0.5  # depth = 1 / (sigmoid / min_depth), arbitrary unit
-    batch_norm_momentum: float = 0.01
+    strides: Annotated[
+        tuple[Count, Count, Count], ASCENDING, "pyramid levels that the decoders read"
+    ] = (8, 16, 32)
+    channels: Annotated[Count, "of ARM, refinement and GCM"] = 128
+    fused: Annotated[Count, "channels behind the FFM"] = 256
+    head: Annotated[Count, "hidden channels of a head"] = 256
+    pose: Annotated[str, "pose encoder: resnet18 (the paper's) or light"] = "resnet18"
+    pose_channels: Annotated[Count, "of the pose decoder"] = 256
+    pose_scale: Annotated[tuple[Positive, Positive], "of translation, rotation"] = (0.01, 0.01)
+    min_depth: Annotated[
+        Positive, "depth = 1 / (sigmoid / min_depth), in the network's arbitrary unit"
+    ] = 0.5
+    batch_norm_momentum: Annotated[float, above(0), most(1), "of all behind the backbone"] = 0.01
 
 
 @dataclass(frozen=True)
-class Loss:
-    """Switches of the loss terms; their fixed weights are in `mtl_bench/core/terms.py`."""
+class Loss(Checked):
+    """Switches of the loss terms; their fixed weights are the tasks'."""
 
-    top_fraction: float = 0.2  # bootstrapped cross-entropy: share of valid pixels kept
-    small_area: int = 4096  # pixels; smaller instances count `small_weight` times
-    small_weight: float = 3.0
-    center_sigma: float = 8.0  # pixels
-    scales: tuple[int, ...] = (0, 1, 2)  # depth outputs in the photometric loss, 0 = finest
-    automask: bool = True  # unwarped frames among the minimum's candidates
-    ssim_weight: float = 0.85
+    top_fraction: Annotated[
+        float, above(0), most(1), "bootstrapped cross-entropy: share of valid pixels kept"
+    ] = 0.2
+    small_area: Annotated[Whole, "pixels; smaller instances count `small_weight` times"] = 4096
+    small_weight: Annotated[NotNegative, "of the pixels of small instances"] = 3.0
+    center_sigma: Annotated[Positive, "pixels, of a center's Gaussian"] = 8.0
+    scales: Annotated[
+        tuple[Whole, ...], SOME, DISTINCT, "depth outputs in the photometric loss, 0 = finest"
+    ] = (0, 1, 2)
+    automask: Annotated[bool, "unwarped frames among the minimum's candidates"] = True
+    ssim_weight: Annotated[Share, "of SSIM in the photometric loss; the rest is L1's"] = 0.85
 
 
 @dataclass(frozen=True)
-class Optim:
+class Optim(Checked):
     """Optimiser, schedule and length."""
 
-    steps: int = 60000
-    batch: int = 12  # samples a step
-    micro_batch: int | None = None  # samples in memory at once, added up to a batch; None: all
-    lr: float = 1e-4  # backbone, GCM, pose network
-    head_lr_factor: float = 10.0  # decoders and heads
-    method_lr: float = 1e-4  # a method's own parameters
-    weight_decay: float = 0.0
-    warmup_steps: int = 1000
-    warmup_factor: float = 0.1
-    poly_power: float = 0.9
-    clip: float | None = 0.01  # total gradient norm
-    precision: str = "fp32"  # fp32 | bf16 | fp16
-    checkpoint_every: int = 1000  # steps
-    cosine_every: int = 0  # steps between logged cosines of the task gradients; 0 = never
+    steps: Annotated[Count, "of the optimiser"] = 60000
+    batch: Annotated[int, least(2), "samples a step; batch statistics of 1x1 maps need two"] = 12
+    micro_batch: Annotated[
+        Annotated[int, least(2)] | None,
+        "samples in memory at once, added up to a batch, which it divides; none: all",
+    ] = None
+    lr: Annotated[NotNegative, "learning rate of backbone, GCM and pose network"] = 1e-4
+    head_lr_factor: Annotated[NotNegative, "times lr: of decoders and heads"] = 10.0
+    method_lr: Annotated[NotNegative, "of a method's own parameters"] = 1e-4
+    weight_decay: Annotated[NotNegative, "of all but a method's own parameters"] = 0.0
+    warmup_steps: Annotated[Whole, "over which the rate rises"] = 1000
+    warmup_factor: Annotated[Share, "of the rate at the first step"] = 0.1
+    poly_power: Annotated[NotNegative, "of the decay (1 - step / steps)^power"] = 0.9
+    clip: Annotated[Positive | None, "total gradient norm"] = 0.01
+    precision: Annotated[str, one_of("fp32", "bf16", "fp16"), "of training"] = "fp32"
+    checkpoint_every: Annotated[Count, "steps; no part of a cell's id"] = 1000
+    cosine_every: Annotated[
+        Whole, "steps between logged cosines of the task gradients; 0: never; no part of the id"
+    ] = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.micro_batch is not None and self.batch % self.micro_batch:
+            raise ValueError(
+                f"recipe.optim.micro_batch = {self.micro_batch} does not divide a batch of "
+                f"{self.batch}; set it to a divisor of recipe.optim.batch"
+            )
 
 
 @dataclass(frozen=True)
-class PseudoLabels:
+class PseudoLabels(Checked):
     """The video stage's labels for frames without human ones; predictions are averaged over all."""
 
-    scales: tuple[float, ...] = (0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0)  # of the input image
-    flip: bool = True  # each scale mirrored, too
-    min_confidence: float = 0.0  # a pixel whose class is less probable than this is left unlabeled
+    scales: Annotated[tuple[Positive, ...], SOME, "of the input image"] = (
+        *(0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0),
+    )
+    flip: Annotated[bool, "each scale mirrored, too"] = True
+    min_confidence: Annotated[
+        Share, "a pixel whose class is less probable than this is left unlabeled"
+    ] = 0.0
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class Evaluate(Checked):
     """Post-processing and protocol of the metrics."""
 
-    split: str = "val"
-    center_threshold: float = 0.3
-    nms_kernel: int = 7  # pixels
-    top_k: int = 200  # centers kept; the paper gives none
-    stuff_area: int = 2048  # pixels; smaller stuff segments become void
-    min_depth_m: float = 0.001
-    max_depth_m: float = 80.0
-    depth_crop: str = "none"  # none: the protocol's | garg | manydepth
-    protocol: str = "full-frame"  # of the depth metrics; see `tasks/depth/protocols.py`
-    also: tuple[str, ...] = ()  # further protocols; their metrics' keys begin with their names
-    flip: bool = False  # inverse depth averaged with that of the mirrored image
+    split: Annotated[str, "which frames: train, val or test"] = "val"
+    center_threshold: Annotated[Share, "least height of an instance's center"] = 0.3
+    nms_kernel: Annotated[Count, ODD, "pixels"] = 7
+    top_k: Annotated[int, least(1), most(999), "centers kept; an id has three digits for them"] = (
+        200
+    )
+    stuff_area: Annotated[Whole, "pixels; smaller stuff segments become void"] = 2048
+    min_depth_m: Annotated[Positive, "true depths above it count"] = 0.001
+    max_depth_m: Annotated[Positive, "true depths below it count"] = 80.0
+    depth_crop: Annotated[str, "none (the protocol's), garg or manydepth"] = "none"
+    protocol: Annotated[str, "of the depth metrics; see `tasks/depth/protocols.py`"] = "full-frame"
+    also: Annotated[
+        tuple[str, ...], "further protocols; their metrics' keys begin with their names"
+    ] = ()
+    flip: Annotated[bool, "inverse depth averaged with that of the mirrored image"] = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_depth_m >= self.max_depth_m:
+            raise ValueError(
+                f"recipe.evaluate.min_depth_m = {self.min_depth_m} must be below max_depth_m = "
+                f"{self.max_depth_m}"
+            )
 
 
 @dataclass(frozen=True)
-class Latency:
+class Latency(Checked):
     """How long to time; the paper uses 500 passes."""
 
-    passes: int = 500
-    warmup: int = 10
-    height: int | None = None  # None: the recipe's input size
-    width: int | None = None
+    passes: Annotated[Count, "timed ones"] = 500
+    warmup: Annotated[Whole, "passes before them"] = 10
+    height: Annotated[Count | None, "pixels; none: the recipe's input"] = None
+    width: Annotated[Count | None, "as height"] = None
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Recipe(Checked):
     """Everything about training that is not the method, backbone or seed."""
 
     name: str = "paper"
     about: str = ""
-    smoke: bool = False  # marks rows that must never be read as results
-    tasks: tuple[str, ...] = ("panoptic", "depth")  # of a cell that names none
+    smoke: Annotated[bool, "marks rows that must never be read as results"] = False
+    # Of a cell that names none
+    tasks: Annotated[tuple[str, ...], SOME, DISTINCT] = ("panoptic", "depth")
     data: Data = field(default_factory=Data)
     augment: Augment = field(default_factory=Augment)
     network: Network = field(default_factory=Network)

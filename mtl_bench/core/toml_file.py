@@ -65,9 +65,14 @@ def read(path: Path) -> TomlFile:
     """A file's values.
 
     Raises:
-        ValueError: not TOML, with line and column.
+        ValueError: not UTF-8, with or without its mark, or not TOML; with line and column.
     """
-    text = path.read_text(encoding="utf-8")
+    content = path.read_bytes()
+    try:
+        text = content.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise ValueError(f"{path}, line {line}: not UTF-8; save it in that encoding") from None
     try:
         return TomlFile(path, text, tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:

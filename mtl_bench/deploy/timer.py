@@ -205,12 +205,10 @@ def measure(
         height, width, device, precision, threads, clock.
 
     Raises:
-        ValueError: no images or no passes.
+        ValueError: no images.
     """
     place = Compute(torch.device(device), precision)
     hosts, K_133 = prepare(images, camera.K_B33[0], latency, pin=place.pinned)
-    if latency.passes < 1:
-        raise ValueError(f"latency.passes must be at least 1, not {latency.passes}")
     seen = replace(camera, K_B33=K_133).map(lambda value: value.to(place.device))
     layout = torch.channels_last if place.channels_last else torch.contiguous_format
 

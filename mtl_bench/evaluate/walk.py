@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from mtl_bench.core import config
-from mtl_bench.core.batch import Batch
+from mtl_bench.core.batch import Batch, collate
 from mtl_bench.core.task import Metric, Results, Size, Task, finish
 from mtl_bench.data.loader import eval_batches
 from mtl_bench.data.samples import Samples, open_samples
@@ -76,12 +76,29 @@ def evaluate(
         return measure(cell, walks, results, device, batch_size, progress)
 
 
+def rehearse(model: Model, cell: config.Cell, root: Path, device: torch.device) -> None:
+    """Read every frame and its truth, and evaluate one of each walk: what would stop an evaluation.
+
+    Worth a call before training.
+
+    Raises:
+        ValueError: as `evaluate`, or a file that is damaged.
+    """
+    with evaluating(model), torch.inference_mode():
+        for walk in open_walks(cell.recipe, model.tasks, root):
+            for index in range(len(walk.samples)):
+                batch = collate([walk.samples.sample(index, None)])
+                if index == 0:
+                    found = predict(model, batch.to(device), walk.tasks, true_size(batch))
+                    for task, metric in walk.measured:
+                        truth = frame_truth(task, batch, 0)
+                        metric.update(truth, frame_of(found[task.name], 0))
+
+
 def open_walks(
     recipe: config.Recipe, tasks: Sequence[Task], root: Path, split: str | None = None
 ) -> list[Walk]:
     """The walks that an evaluation takes, the main one first; decodes nothing.
-
-    Worth a call before training: it finds what would stop the evaluation after it.
 
     Raises:
         ValueError: a protocol that the data set cannot serve, or a split that lacks its files.

@@ -188,12 +188,15 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
     Raises:
         ValueError: an unknown backbone, or an input that the pyramid does not divide.
     """
-    sizes, data = cell.recipe.network, cell.recipe.data
-    if data.height % sizes.strides[2] or data.width % sizes.strides[2]:
-        raise ValueError(
-            f"input {data.height}x{data.width} is not divisible by the deepest stride "
-            f"{sizes.strides[2]}: change data.height, data.width or network.strides"
-        )
+    sizes, data, timed = cell.recipe.network, cell.recipe.data, cell.recipe.latency
+    input_size = data.height, data.width
+    timed_size = timed.height or data.height, timed.width or data.width
+    for section, (height, width) in (("data", input_size), ("latency", timed_size)):
+        if height % sizes.strides[2] or width % sizes.strides[2]:
+            raise ValueError(
+                f"input {height}x{width} is not divisible by the deepest stride "
+                f"{sizes.strides[2]}: change {section}.height, {section}.width or network.strides"
+            )
     kind = plugins.load("backbones", cell.backbone)
     backbone = kind(strides=sizes.strides, pretrained=cell.pretrained, **cell.backbone_args)
     model = Model(Network(backbone, sizes, tasks), tasks)

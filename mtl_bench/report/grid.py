@@ -92,6 +92,19 @@ class Layout:
         return tuple(over_speed) if self.readme is None else self.readme
 
 
+def check(grid: Any) -> None:
+    """What `build` would find wrong with a grid's section [report], before there is a row.
+
+    Raises:
+        ValueError: a key or a value that it cannot have, or lines by what no cell has.
+    """
+    layout = Layout.of(grid.report)
+    fields = {key for job in grid.jobs for key in cell_of(grid.kind.identity(job))}
+    fields |= {"name"} if grid.names else set()
+    if fields and layout.rows not in fields:
+        raise ValueError(f"[report] rows: no '{layout.rows}'{did_you_mean(layout.rows, fields)}")
+
+
 def _check(kind: str, names: Iterable[str], possible: Iterable[str]) -> None:
     possible = tuple(possible)
     for name in names:

@@ -2,7 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -38,6 +38,7 @@ def train(
     *,
     start: Path | None = None,
     further_labels: Path | None = None,
+    rehearse: Callable[[Model], None] | None = None,
 ) -> Model:
     """Train a cell to its last step, from its own checkpoint where there is one.
 
@@ -47,6 +48,8 @@ def train(
         start: checkpoint whose model and method a fresh run goes on from; optimiser and learning
             rate begin anew.
         further_labels: folder of labels of further frames to train on.
+        rehearse: is shown the model before the first step, to raise what would stop it after the
+            last.
 
     Raises:
         FloatingPointError: a loss term is NaN or infinite.
@@ -54,8 +57,10 @@ def train(
     """
     optim = cell.recipe.optim
     model, method, optimizer = build(cell, compute)
-    torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
     path, step = run_dir / CHECKPOINT, 0
+    if rehearse is not None and not path.is_file():
+        rehearse(model)
+    torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
     if path.is_file():
         state = checkpoint.read(path)
         step = checkpoint.restore(state, model, method, optimizer, compute.scaler)
@@ -130,8 +135,6 @@ def train(
 def build(cell: Cell, compute: Compute) -> tuple[Model, Method, torch.optim.Optimizer]:
     """Model, method and optimiser as they are before the first step."""
     optim = cell.recipe.optim
-    if optim.batch < 2:
-        raise ValueError("optim.batch must be at least 2: batch statistics of 1x1 maps need two")
     tasks = tasks_of_cell(cell)
     with initial_weights(cell.seed):
         model = build_model(cell, tasks)

@@ -6,7 +6,7 @@ from mtl_bench.bench import grid as grids
 from mtl_bench.bench.grid import load_grid
 from mtl_bench.bench.jobs import CELLS, with_parents
 from mtl_bench.core import plugins
-from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.core.config import Cell, check_cells, load_recipe
 
 GRID = """question = "Does it work?"
 recipe = "smoke"
@@ -48,7 +48,7 @@ def test_shipped_grids_expand_and_name_existing_plugins():
         assert grid.question.endswith("?")
         assert grids.question_of(name) == grid.question
         assert grid.cells
-        plugins.check_cells([*grid.cells, *(skip.job for skip in grid.skips)])
+        check_cells([*grid.cells, *(skip.job for skip in grid.skips)])
 
 
 def test_a_grid_may_name_its_smoke_recipe(write):
@@ -219,8 +219,8 @@ def test_a_factor_multiplies_the_recipes_number_whatever_it_is(write):
 
 
 def test_a_factor_is_for_numbers_only(write):
-    text = ROWS.replace('"recipe.optim.steps"', '"recipe.optim.precision"')
-    assert load_grid(write(text)).cells[1].recipe.optim.precision == "2x"
+    text = ROWS.replace('"recipe.optim.steps"', '"recipe.evaluate.split"')
+    assert load_grid(write(text)).cells[1].recipe.evaluate.split == "2x"
     text = ROWS.replace('"recipe.optim.steps"', '"recipe.optim.micro_batch"')
     with pytest.raises(ValueError, match=r"line 17: .*micro_batch' must be int, not '2x'"):
         load_grid(write(text))

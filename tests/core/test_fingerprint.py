@@ -245,7 +245,7 @@ def test_a_helper_imported_by_name_is_the_same_as_through_its_module(tree, tmp_p
 
 def test_a_file_that_is_no_python_is_named(tree, tmp_path):
     (tmp_path / "bad.py").write_text("class Mine(")
-    with pytest.raises(ValueError, match=r"bad.py: SyntaxError"):
+    with pytest.raises(ValueError, match=r"bad.py, line 1: SyntaxError"):
         tree(Root(tmp_path / "bad.py"))
     with pytest.raises(ValueError, match=r"train.py defines no 'trane'"):
         tree(Root(tree.package / "train.py", ("trane",)))

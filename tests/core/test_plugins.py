@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from mtl_bench.core import plugins, provenance, quality
-from mtl_bench.core.config import Cell, Recipe, load_recipe
+from mtl_bench.core.config import Cell, Recipe, check_cells, load_recipe
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.task import tasks_of_cell, terms_of
 
@@ -74,7 +74,7 @@ def test_working_directory(tmp_path):
     put(tmp_path / "methods" / "mine.py")
     assert described("mine").summary == "Doubles everything."
     assert plugins.load("methods", "mine").__name__ == "Mine"
-    assert plugins.settings("methods", "mine") == {"factor": 2.0}
+    assert plugins.arguments("methods", "mine")["factor"].default == 2.0
     assert "mine" not in plugins.files("backbones")
 
 
@@ -202,13 +202,13 @@ def test_a_composition_is_both_files(tmp_path):
         prints.append(plugins.fingerprint("methods", "first+second"))
     assert len(set(prints)) == 3
     cell = Cell(Recipe(), "tiny", "first+second", method_args={"second": {"factor": 1.0}})
-    plugins.check_cells([cell])
+    check_cells([cell])
     for values, message in (
         ({"third": {}}, "has no part 'third'"),
         ({"second": {"factr": 1.0}}, "did you mean 'factor'"),
     ):
         with pytest.raises(ValueError, match=message):
-            plugins.check_cells([replace(cell, method_args=values)])
+            check_cells([replace(cell, method_args=values)])
 
 
 def test_an_edited_file_is_loaded_anew(tmp_path):
@@ -216,19 +216,19 @@ def test_an_edited_file_is_loaded_anew(tmp_path):
     first = plugins.load("methods", "mine")
     assert plugins.load("methods", "mine") is first
     put(tmp_path / "methods" / "mine.py", METHOD.replace("factor=2.0", "factor=30.0"))
-    assert plugins.settings("methods", "mine") == {"factor": 30.0}
+    assert plugins.arguments("methods", "mine")["factor"].default == 30.0
 
 
 def test_hyper_parameters_are_checked_against_the_constructor(tmp_path):
     put(tmp_path / "methods" / "mine.py")
     good = Cell(Recipe(), "tiny", "mine", method_args={"factor": 3.0})
-    plugins.check_cells([good])
+    check_cells([good])
     with pytest.raises(ValueError, match=r"method 'mine' has no 'facto' \(did you mean 'factor'"):
-        plugins.check_cells([Cell(Recipe(), "tiny", "mine", method_args={"facto": 3.0})])
+        check_cells([Cell(Recipe(), "tiny", "mine", method_args={"facto": 3.0})])
     with pytest.raises(ValueError, match="method 'mine' has no 'seed'"):
-        plugins.check_cells([Cell(Recipe(), "tiny", "mine", method_args={"seed": 3})])
+        check_cells([Cell(Recipe(), "tiny", "mine", method_args={"seed": 3})])
     with pytest.raises(ValueError, match="no backbone called 'tny'"):
-        plugins.check_cells([Cell(Recipe(), "tny", "mine")])
+        check_cells([Cell(Recipe(), "tny", "mine")])
 
 
 def test_children_find_added_folders_and_describing_imports_nothing(tmp_path):
@@ -272,7 +272,7 @@ def test_a_further_task_changes_no_cell_that_does_not_name_it(tmp_path):
     assert [(cell.id, provenance.code(cell), cell.tasks) for cell in again] == before
     assert [term.name for term in terms_of(tasks_of_cell(again[0]))] == terms
     three = replace(cells[0], tasks=("normals", "depth", "panoptic"))
-    plugins.check_cells([three])
+    check_cells([three])
     assert three.id != cells[0].id
     names = [task.name for task in tasks_of_cell(three)]
     assert names == ["panoptic", "depth", "normals"]

@@ -219,7 +219,7 @@ def test_all_frames_train_but_those_that_measure(tree):
     assert dataset.dataset.described["frames_published"] is None
     assert dataset.sample(len(dataset) - 1, generator()).image_B3HW.shape == (3, HEIGHT, WIDTH)
     with pytest.raises(ValueError, match="must be published or all, not 'most'"):
-        open_tree(tree, data=replace(data, train_frames="most"))
+        replace(data, train_frames="most")
 
 
 def test_truth_of_test_frames(tree):

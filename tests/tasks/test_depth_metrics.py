@@ -42,8 +42,6 @@ def test_garg_crop_of_a_kitti_frame():
     rows, columns = mask.any(1).nonzero()[0], mask.any(0).nonzero()[0]
     assert (rows[0], rows[-1] + 1, columns[0], columns[-1] + 1) == (153, 371, 44, 1197)
     assert mask.sum() == (371 - 153) * (1197 - 44)
-    with pytest.raises(ValueError, match="one of none, garg, manydepth, not 'eigen'"):
-        evaluation_mask(np.ones((4, 4)), config.Evaluate(depth_crop="eigen"))
 
 
 def test_images_weigh_alike_however_many_pixels_they_have():

@@ -223,11 +223,6 @@ def test_equal_neighbours_are_both_centers():
     assert centers.tolist() == [[[4, 3], [4, 4], [10, 18]]]
 
 
-def test_an_even_kernel_is_refused():
-    with pytest.raises(ValueError, match="nms_kernel must be odd, not 4"):
-        grouping.find_centers(torch.zeros(1, 1, 8, 8), settings(nms_kernel=4))
-
-
 def test_instance_ids_are_cityscapes_own():
     panoptic = torch.tensor(
         [[[-1, ROAD * 1000, 0, CAR * 1000 + 7, CAR * 1000, PERSON * 1000 + 200]]]

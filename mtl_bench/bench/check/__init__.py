@@ -14,6 +14,7 @@ from mtl_bench.bench.check.engines import ENGINE_CHECKS
 from mtl_bench.bench.check.methods import METHOD_CHECKS
 from mtl_bench.bench.check.tasks import TASK_CHECKS
 from mtl_bench.core import plugins
+from mtl_bench.core.fingerprint import content
 
 CHECKS: dict[str, Mapping[str, Callable[..., Any]]] = {
     "methods": METHOD_CHECKS,
@@ -55,7 +56,7 @@ def _run(name: str, call: Callable[[], Any]) -> CheckResult:
     """
     try:
         said = call()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}:{place.lineno}"
         return CheckResult(name, False, f"{type(error).__name__}: {error} ({where})")
@@ -63,6 +64,6 @@ def _run(name: str, call: Callable[[], Any]) -> CheckResult:
 
 
 def _documented(path: Path) -> None:
-    text = ast.get_docstring(ast.parse(path.read_text())) or ""
+    text = ast.get_docstring(ast.parse(content(path))) or ""
     if len(text.splitlines()) < 2:
         raise ValueError("the file's docstring needs a line saying what it does, then its source")

@@ -34,14 +34,7 @@ class Limits(typing.Protocol):
 
 
 def evaluation_mask(true_m_HW: NDArray[Any], limits: Limits) -> NDArray[np.bool_]:
-    """Pixels that count: strictly inside the range and, by `depth_crop`, one of CROPS.
-
-    Raises:
-        ValueError: another crop.
-    """
-    if limits.depth_crop not in CROPS:
-        known = ", ".join(CROPS)
-        raise ValueError(f"evaluate.depth_crop must be one of {known}, not '{limits.depth_crop}'")
+    """Pixels that count: strictly inside the range and, by `depth_crop`, one of CROPS."""
     top, bottom, left, right = CROPS[limits.depth_crop]
     height, width = true_m_HW.shape
     inside_HW = np.zeros(true_m_HW.shape, np.bool_)

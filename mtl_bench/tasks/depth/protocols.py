@@ -11,6 +11,7 @@ from typing import Any
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.plain import did_you_mean
 from mtl_bench.core.recipe import Recipe
+from mtl_bench.tasks.depth.metrics import CROPS
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def of_recipe(recipe: Recipe, split: str | None = None) -> tuple[Protocol, ...]:
         split: in place of every protocol's.
 
     Raises:
-        ValueError: as `named`, or a protocol that is asked for twice.
+        ValueError: as `named`, a crop that is none, or a protocol that is asked for twice.
     """
     ev = recipe.evaluate
     if len({ev.protocol, *ev.also}) <= len(ev.also):
@@ -114,6 +115,9 @@ def of_recipe(recipe: Recipe, split: str | None = None) -> tuple[Protocol, ...]:
             f"recipe.evaluate.also = {list(ev.also)} has a protocol twice, or the main one, "
             f"'{ev.protocol}'; name each once"
         )
+    if ev.depth_crop not in CROPS:
+        known = did_you_mean(ev.depth_crop, CROPS)
+        raise ValueError(f"no recipe.evaluate.depth_crop called '{ev.depth_crop}'{known}")
     main = named(ev.protocol, recipe)
     others = [named(name, recipe) for name in ev.also]
     own = {"min_depth_m": ev.min_depth_m, "max_depth_m": ev.max_depth_m}

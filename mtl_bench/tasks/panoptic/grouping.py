@@ -60,8 +60,6 @@ def find_centers(center_B1HW: Tensor, ev: config.Evaluate) -> tuple[Tensor, Tens
     Equal neighbours are both centers: of two true instances closer than the kernel neither is lost.
     K is the most that an image has, at least 1; in an exported graph it is `ev.top_k`.
     """
-    if ev.nms_kernel % 2 == 0:
-        raise ValueError(f"evaluate.nms_kernel must be odd, not {ev.nms_kernel}")
     heat_B1HW = center_B1HW.float()
     images, _, height, width = heat_B1HW.shape
     pixel_P = pixels.where(pixels.peaks(heat_B1HW, ev.nms_kernel, ev.center_threshold))

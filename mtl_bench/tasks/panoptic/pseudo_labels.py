@@ -58,15 +58,9 @@ def label(
         The folder with the labels.
 
     Raises:
-        ValueError: options without meaning, labels of another making, or a prediction that is not
-            finite.
+        ValueError: labels of another making, or a prediction that is not finite.
     """
     recipe = task.recipe
-    options = recipe.pseudo
-    if not options.scales or min(options.scales) <= 0:
-        raise ValueError(f"pseudo.scales must be positive numbers, not {list(options.scales)}")
-    if not 0 <= options.min_confidence <= 1:
-        raise ValueError(f"pseudo.min_confidence must be 0 to 1, not {options.min_confidence}")
     _claim_folder(frames, _record(model, recipe, frames, task.labels))
     done = frames.done()
     count = len(done)
