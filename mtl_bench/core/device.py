@@ -27,7 +27,9 @@ class Compute:
         ValueError: CUDA asked for where there is none, or fp16 on the CPU.
     """
 
-    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"train": ("apply_gradients", "pinned")}
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {
+        "train": ("skips_overflow", "gradient_norm", "apply", "pinned")
+    }
 
     device: torch.device
     precision: str = "fp32"
@@ -39,6 +41,7 @@ class Compute:
         if self.precision == "fp16" and self.device.type == "cpu":
             raise ValueError("precision fp16 trains on CUDA only: use bf16 or fp32 on the CPU")
         self.scaler = torch.amp.GradScaler(self.device.type, enabled=self.precision == "fp16")
+        self.scaler.scale(torch.zeros(1, device=self.device))  # it begins with the first such call
 
     @property
     def channels_last(self) -> bool:
@@ -60,15 +63,23 @@ class Compute:
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, DTYPES[self.precision])
 
-    def apply_gradients(
+    @property
+    def skips_overflow(self) -> bool:
+        """Whether gradients that are not finite are the loss scale's fault, which then halves."""
+        return self.scaler.is_enabled() and self.scaler.get_scale() > 1
+
+    def gradient_norm(
         self, optimizer: torch.optim.Optimizer, parameters: list[Tensor], clip: float | None
     ) -> float:
-        """Unscale, clip to a total norm of `clip`, step. Returns the norm before clipping."""
+        """Unscale, and clip to a total norm of `clip`. Returns the norm before clipping."""
         self.scaler.unscale_(optimizer)
         norm = torch.nn.utils.clip_grad_norm_(parameters, clip if clip is not None else torch.inf)
+        return norm.item()
+
+    def apply(self, optimizer: torch.optim.Optimizer) -> None:
+        """Step, unless fp16 has overflowed."""
         self.scaler.step(optimizer)
         self.scaler.update()
-        return norm.item()
 
 
 def choose_device(name: str = "auto") -> torch.device:

@@ -247,7 +247,7 @@ class Task:
         return {}
 
     def losses(self, maps: Maps, batch: Batch) -> dict[str, Tensor]:
-        """Unweighted terms by name; one without labels in this batch is absent."""
+        """Unweighted terms by name; one without labels, or without a pixel of them, is absent."""
         raise NotImplementedError
 
     def training_protocol(self, dataset: Dataset) -> dict[str, Any]:

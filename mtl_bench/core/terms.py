@@ -18,15 +18,25 @@ class Term:
     parts: tuple["Term", ...] = ()  # of a task: its terms
 
 
+def present(losses: Mapping[str, Tensor | None]) -> dict[str, Tensor]:
+    """Those that there are: a term whose pixels are none is absent, not solved.
+
+    A loss of 0 would tell a method that the term needs nothing more, and some then weigh all others
+    by next to nothing.
+    """
+    return {name: loss for name, loss in losses.items() if loss is not None}
+
+
 def gather(losses: Mapping[str, Tensor], terms: Sequence[Term]) -> dict[str, Tensor]:
     """The losses that these terms stand for; a task's is the sum of its terms at fixed weights.
 
-    A term is absent where the batch has no labels for it, a task where it lacks one of its terms.
+    A term is absent where the batch has no labels for it, a task where it has none of its terms.
     """
     found: dict[str, Tensor] = {}
     for term in terms:
-        if all(part.name in losses for part in term.parts) and term.parts:
-            weighted = [part.fixed_weight * losses[part.name] for part in term.parts]
+        here = [part for part in term.parts if part.name in losses]
+        if here:
+            weighted = [part.fixed_weight * losses[part.name] for part in here]
             found[term.name] = torch.stack(weighted).sum()
         elif not term.parts and term.name in losses:
             found[term.name] = losses[term.name]

@@ -58,6 +58,10 @@ class Pass:
 Forward = Callable[[], Pass]  # sends one part of a batch through the model
 
 
+class UnlabelledError(ValueError):
+    """A batch has no pixel of any term that the method weighs: there is nothing to train on."""
+
+
 class Split(Protocol):
     """A model that says which parameters all tasks train and which only one of them."""
 
@@ -108,29 +112,37 @@ def backward(
 
 
 def reevaluate(method: Method, step: Step, parts: Sequence[Forward], model: Split) -> None:
-    """Tell a method that asks for it what the batch's losses are after its step."""
-    method.after_step(step, step_of(method, losses_now(parts, model)).loss_K)
+    """Tell a method that asks for it what the batch's losses are after its step.
 
-
-def losses_now(parts: Sequence[Forward], model: Split) -> dict[str, Tensor]:
-    """A batch's loss terms under the present parameters; leaves no trace in the model."""
-    return mean_losses(_losses_of(parts, model))
+    A step may move a term's last pixel out of view: the method then hears nothing of that term.
+    """
+    after = _mine(method, losses_of(parts, model))
+    names = _names_of(method, step)
+    kept = [index for index, name in enumerate(names) if name in after]
+    if kept:
+        still = Step(step.loss_K[kept], step.present[kept])
+        method.after_step(still, torch.stack([after[names[index]] for index in kept]))
 
 
 # --- losses ---------------------------------------------------------------------------------------
 
 
-def step_of(method: Method, losses: Mapping[str, Tensor]) -> Step:
-    """What the method sees of a batch's loss terms, in its own order.
+def _step_of(method: Method, parts: Sequence[Mapping[str, Tensor]]) -> Step:
+    """What the method sees of the loss terms of a batch's parts, in its own order.
 
     Raises:
-        ValueError: there are none.
+        UnlabelledError: there are none.
     """
-    mine = gather(losses, method.terms)
+    mine = _mine(method, parts)
     if not mine:
-        raise ValueError("a batch without labels for any of the cell's tasks: nothing to train on")
-    present = torch.tensor([i for i, term in enumerate(method.terms) if term.name in mine])
-    return Step(torch.stack(list(mine.values())), present)
+        raise UnlabelledError("a batch without labels for any of the cell's tasks: no training")
+    present = [i for i, term in enumerate(method.terms) if term.name in mine]
+    return Step(torch.stack([mine[method.terms[i].name] for i in present]), torch.tensor(present))
+
+
+def _mine(method: Method, parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """The losses that the method weighs: means over the parts that have them."""
+    return mean_losses([gather(part, method.terms) for part in parts])
 
 
 def mean_losses(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
@@ -142,7 +154,7 @@ def mean_losses(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.stack(values).mean(0) for name, values in found.items()}
 
 
-def _losses_of(parts: Sequence[Forward], model: Split) -> list[Mapping[str, Tensor]]:
+def losses_of(parts: Sequence[Forward], model: Split) -> list[Mapping[str, Tensor]]:
     """Each part's loss terms under the present parameters; leaves no trace in the model."""
     with torch.no_grad(), frozen_statistics(model):
         return [part().losses for part in parts]
@@ -150,16 +162,16 @@ def _losses_of(parts: Sequence[Forward], model: Split) -> list[Mapping[str, Tens
 
 def _looked_at(
     method: Method, parts: Sequence[Forward], model: Split
-) -> tuple[dict[str, Tensor], Counter[str], Iterator[Pass]]:
-    """A batch's mean losses, in how many parts the method has each, and then its passes.
+) -> tuple[list[Mapping[str, Tensor]], Counter[str], Iterator[Pass]]:
+    """The parts' losses, in how many of them the method has each, and then their passes.
 
     Weights may depend on all losses, so a batch in several parts is run twice: for its losses, and
     for its gradients once the weights are known.
     """
     single = [parts[0]()] if len(parts) == 1 else []
-    seen = [passed.losses for passed in single] or _losses_of(parts, model)
+    seen = [passed.losses for passed in single] or losses_of(parts, model)
     count = Counter(name for losses in seen for name in gather(losses, method.terms))
-    return mean_losses(seen), count, (single.pop() if single else part() for part in parts)
+    return seen, count, (single.pop() if single else part() for part in parts)
 
 
 def _names_of(method: Method, step: Step) -> list[str]:
@@ -188,18 +200,20 @@ def _by_losses(
     method: LossMethod, parts: Sequence[Forward], model: Split, scale: float, cosines: bool
 ) -> Weighting:
     """The weights are the derivatives of the method's scalar."""
-    losses, count, passes = _looked_at(method, parts, model)
-    step = step_of(method, losses)
+    seen, count, passes = _looked_at(method, parts, model)
+    step = _step_of(method, seen)
     total, scaled_K = _differentiate(method, step, scale)
     cosine_of: dict[str, float] = {}
     scaled = dict(zip(_names_of(method, step), scaled_K, strict=True))
     for number, passed in enumerate(passes):
         mine = gather(passed.losses, method.terms)
+        if not mine:
+            continue
         if cosines and number == 0:
             cosine_of = _measured(mine, list(passed.representation), model)
         grads = [scaled[name] / count[name] for name in mine]
         torch.autograd.backward(list(mine.values()), grads)
-    return _weighting(method, losses, step, scaled_K / scale, cosine_of, total)
+    return _weighting(method, mean_losses(seen), step, scaled_K / scale, cosine_of, total)
 
 
 def _differentiate(method: LossMethod, step: Step, scale: float) -> tuple[float, Tensor]:
@@ -269,13 +283,13 @@ class _ByGradients:
         """Gradients of two batches for the weights, one weighted pass of a third for the update.
 
         Raises:
-            ValueError: the two batches have no loss in common.
+            UnlabelledError: the two batches have no loss in common.
         """
         seen = [self._differentiated(parts, self.scale, []) for parts in batches[:2]]
         names = [name for name in seen[0].names if name in seen[1].names]
         if not names:
             name = type(self.method).__name__
-            raise ValueError(f"{name} compares batches, and they share no labels")
+            raise UnlabelledError(f"{name} compares batches, and they share no labels")
         places = [[one.names.index(name) for name in names] for one in seen]
         rows = [[one.rows[i] for i in place] for one, place in zip(seen, places, strict=True)]
         loss_K, other_K = (one.step.loss_K[place] for one, place in zip(seen, places, strict=True))
@@ -327,11 +341,13 @@ class _ByGradients:
                     self.shared, unflatten(direction_P, self.shared), strict=True
                 ):
                     parameter.sub_(lr * move)
-            with frozen_statistics(self.model):
-                seen = self._differentiated(batches[1], 1.0, [])
-            with torch.no_grad():
-                for parameter, value in zip(self.shared, before, strict=True):
-                    parameter.copy_(value)
+            try:
+                with frozen_statistics(self.model):
+                    seen = self._differentiated(batches[1], 1.0, [])
+            finally:
+                with torch.no_grad():
+                    for parameter, value in zip(self.shared, before, strict=True):
+                        parameter.copy_(value)
             assert isinstance(seen.gradients, Matrix)
             ahead_KP = seen.gradients.J_KP * first_T[seen.step.present][:, None]
             return ahead_KP.nan_to_num(0.0, 0.0, 0.0)  # an overflow there says nothing
@@ -364,12 +380,11 @@ class _ByGradients:
             del passed  # which holds the losses, too
             count.update(mine.keys())
             gradients.add(z, _through_decoders(mine, z, own, own_of, scale))
-        losses = mean_losses(looked_at)
-        step = step_of(self.method, losses)
+        step = _step_of(self.method, looked_at)
         names = _names_of(self.method, step)
         rows = gradients.mean({name: scale * count[name] for name in names})
         means = {name: divided(own_of[name], count[name]) for name in names}
-        return _Seen(losses, step, names, rows, gradients, means)
+        return _Seen(mean_losses(looked_at), step, names, rows, gradients, means)
 
     def _weighted_pass(
         self, parts: Sequence[Forward], names: Sequence[str], weight_K: Tensor, head_K: Tensor
@@ -378,7 +393,7 @@ class _ByGradients:
 
         Losses without a name here are left out.
         """
-        losses, count, passes = _looked_at(self.method, parts, self.model)
+        seen, count, passes = _looked_at(self.method, parts, self.model)
         factors = [self.scale / max(count[name], 1) for name in names]
         factor_K = torch.tensor(factors).to(weight_K)
         own_of: dict[str, list[Tensor | None]] = {}
@@ -387,6 +402,8 @@ class _ByGradients:
             mine, z = gather(passed.losses, self.method.terms), list(passed.representation)
             mine = {name: loss for name, loss in mine.items() if name in names}
             del passed
+            if not mine:
+                continue
             z_grads = _through_decoders(mine, z, self.own, own_of, 1.0)
             here = [names.index(name) for name in z_grads]
             weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))
@@ -394,7 +411,7 @@ class _ByGradients:
         for parameter, grad in zip(self.shared, total, strict=True):
             parameter.grad = grad
         self._add_own(own_of, names, head_K * factor_K)
-        return losses
+        return mean_losses(seen)
 
     def _add_own(
         self,

@@ -1,8 +1,9 @@
 """The training loop, to be read from top to bottom."""
 
 import itertools
+import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,19 +14,20 @@ from mtl_bench.core import plugins
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
 from mtl_bench.core.device import Compute, initial_weights, seed_for
-from mtl_bench.core.method import Composed, LossMethod, Method
+from mtl_bench.core.method import Composed, LossMethod, Method, Step
 from mtl_bench.core.task import Task, tasks_of_cell, terms_of
 from mtl_bench.core.terms import Term
 from mtl_bench.data.loader import train_batches
 from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model, build_model
 from mtl_bench.train import checkpoint
-from mtl_bench.train.backward import Pass, Weighting, backward, reevaluate
+from mtl_bench.train.backward import Pass, UnlabelledError, Weighting, backward, reevaluate
 from mtl_bench.train.curve import Curve
 from mtl_bench.train.progress import Interrupted, Pace, Progress
 from mtl_bench.train.tracking import Tracker
 
 CHECKPOINT = "last.pt"
+NOTHING = Weighting(0.0, Step(torch.zeros(0), torch.zeros(0, dtype=torch.int64)), {}, {})
 
 
 def train(
@@ -52,7 +54,9 @@ def train(
             last.
 
     Raises:
-        FloatingPointError: a loss term is NaN or infinite.
+        FloatingPointError: a loss term, the method's answer or what would be saved is NaN or
+            infinite.
+        UnlabelledError: the first batch has no pixel of any term; a later one is passed over.
         Interrupted: a signal asked to stop; the state is saved.
     """
     optim = cell.recipe.optim
@@ -80,6 +84,7 @@ def train(
     model.train()
 
     def save() -> None:
+        check_state(model, method, optimizer, cell.method, step)
         curve.flush()  # first: the rows up to a checkpoint's step must never be missing
         checkpoint.save(path, step, model, method, optimizer, compute.scaler)
 
@@ -102,18 +107,29 @@ def train(
                 for split in (batch.split(optim.micro_batch or optim.batch) for batch in drawn)
             ]
             optimizer.zero_grad(set_to_none=True)
-            weighting = backward(
-                method,
-                parts,
-                model,
-                scale=compute.scaler.get_scale(),
-                lr=optimizer.param_groups[0]["lr"],
-                cosines=bool(optim.cosine_every) and step % optim.cosine_every == 0,
-            )
-            update_norm = norm_of(model.shared_parameters()) / compute.scaler.get_scale()
-            grad_norm = compute.apply_gradients(optimizer, clipped, optim.clip)
-            if method.reevaluates:
-                reevaluate(method, weighting.step, parts[0], model)
+            weighting, update_norm, grad_norm = NOTHING, 0.0, 0.0
+            try:
+                weighting = backward(
+                    method,
+                    parts,
+                    model,
+                    scale=compute.scaler.get_scale(),
+                    lr=optimizer.param_groups[0]["lr"],
+                    cosines=bool(optim.cosine_every) and step % optim.cosine_every == 0,
+                )
+            except UnlabelledError:
+                if step == 0:  # rather a folder without labels than an unlucky crop
+                    raise
+            else:
+                update_norm = norm_of(model.shared_parameters()) / compute.scaler.get_scale()
+                grad_norm = compute.gradient_norm(optimizer, clipped, optim.clip)
+                if not compute.skips_overflow:
+                    check_weighting(weighting, cell.method, step)
+                    norms = (update_norm, grad_norm, norm_of(method.parameters()))
+                    check_gradients(norms, cell.method, step)
+                compute.apply(optimizer)
+                if method.reevaluates:
+                    reevaluate(method, weighting.step, parts[0], model)
             step += 1
 
             row = describe_step(weighting, method, model.tasks, bool(optim.cosine_every))
@@ -201,6 +217,54 @@ def check_finite(losses: dict[str, Tensor], step: int) -> None:
             raise FloatingPointError(
                 f"loss term '{name}' is {loss.item()} at step {step}: lower recipe.optim.lr, "
                 f"or set recipe.optim.clip, and look at the batch's data"
+            )
+
+
+def check_weighting(weighting: Weighting, method: str, step: int) -> None:
+    """Raise where the method's answer to finite losses and gradients is not finite."""
+    for term, weight in weighting.weights.items():
+        if not math.isfinite(weight):
+            raise FloatingPointError(
+                f"method '{method}' weighs '{term}' by {weight} at step {step}, of losses "
+                f"{weighting.losses}"
+            )
+    if not math.isfinite(weighting.total):
+        raise FloatingPointError(
+            f"method '{method}' makes {weighting.total} of the losses {weighting.losses} "
+            f"at step {step}"
+        )
+
+
+def check_gradients(norms: Iterable[float], method: str, step: int) -> None:
+    for norm in norms:
+        if not math.isfinite(norm):
+            raise FloatingPointError(
+                f"method '{method}' leaves a gradient of norm {norm} at step {step}, of losses and "
+                f"weights that are finite: lower recipe.optim.lr, or look at the method's direction"
+            )
+
+
+def check_state(
+    model: nn.Module, method: nn.Module, optimizer: torch.optim.Optimizer, name: str, step: int
+) -> None:
+    """Raise where what a checkpoint would keep is not finite: every retry would begin with it.
+
+    A method may keep an infinity on purpose, such as a best value that was not seen yet.
+    """
+    moments = {f"{i}.{k}": v for i, s in enumerate(optimizer.state.values()) for k, v in s.items()}
+    held = [
+        ("the model", model.state_dict(), torch.isfinite),
+        (f"method '{name}'", method.state_dict(), lambda value: ~torch.isnan(value)),
+        ("the optimiser", moments, torch.isfinite),
+    ]
+    for owner, state, good in held:
+        floats = {k: v for k, v in state.items() if torch.is_tensor(v) and v.is_floating_point()}
+        fine = [good(value).all() for value in floats.values()]
+        if fine and not torch.stack([one.cpu() for one in fine]).all():
+            key = next(key for key, one in zip(floats, fine, strict=True) if not one)
+            raise FloatingPointError(
+                f"'{key}' of {owner} is not finite after step {step} of method '{name}', so it is "
+                f"not saved: lower recipe.optim.lr, or set recipe.optim.clip"
             )
 
 

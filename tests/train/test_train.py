@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from support.training import CPU, curve, run
 
 from mtl_bench.core.config import Optim, to_dict
 from mtl_bench.core.device import Compute, choose_device, seed_for
@@ -21,20 +22,6 @@ from mtl_bench.train.curve import data_share
 from mtl_bench.train.loop import build, schedule, train
 from mtl_bench.train.progress import Interrupted, Progress
 from mtl_bench.train.tracking import Tracker
-
-CPU = torch.device("cpu")
-
-
-def run(cell, root: Path, run_dir: Path, progress=None, **options):
-    run_dir.mkdir(exist_ok=True)
-    progress = progress or Progress(run_dir, lambda line: None)
-    tracker = Tracker("off", cell, run_dir)
-    return train(cell, root, run_dir, Compute(CPU), progress, tracker, **options)
-
-
-def curve(run_dir: Path) -> list[dict[str, str]]:
-    with (run_dir / "curve.csv").open() as file:
-        return list(csv.DictReader(file))
 
 
 def states(run_dir: Path) -> dict[str, torch.Tensor]:

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -9,10 +10,12 @@ from torch import Tensor
 
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, load_recipe
-from mtl_bench.core.dataset import NEIGHBOURS, dataset_of
+from mtl_bench.core.dataset import NEIGHBOURS, DecodedFrame, Kind, dataset_of
+from mtl_bench.core.labels import OUTSIDE
 from mtl_bench.core.plugins import files
 from mtl_bench.core.quality import columns_of
 from mtl_bench.core.task import Results, Task, tasks_of, terms_of
+from mtl_bench.data.augment import OUTSIDE_OF
 from mtl_bench.data.loader import eval_batches, train_batches
 from mtl_bench.data.samples import open_samples
 from mtl_bench.evaluate.walk import evaluating, frame_of, frame_truth, predict, true_size
@@ -37,7 +40,7 @@ def _model(kind: type[Task]) -> Model:
         return build_model(Cell(recipe, BACKBONE, "", names), tasks)
 
 
-def _on_built_in(check: Callable[[type[Task]], None]) -> Callable[[type[Task]], str | None]:
+def _on_built_in(check: Callable[[type[Task]], str | None]) -> Callable[[type[Task]], str | None]:
     """Only where the built-in data have what the task needs."""
 
     def checked(kind: type[Task]) -> str | None:
@@ -45,8 +48,7 @@ def _on_built_in(check: Callable[[type[Task]], None]) -> Callable[[type[Task]], 
         lacking = sorted((kind.needs | kind.truth) - has)
         if lacking:
             return f"not tried: the built-in data have no {', '.join(lacking)}"
-        check(kind)
-        return None
+        return check(kind)
 
     return checked
 
@@ -99,6 +101,40 @@ def _losses(kind: type[Task]) -> None:
         raise ValueError(f"no loss trains {', '.join(heads.keys() - trained)}")
 
 
+_BLANK = {Kind.IDS, Kind.DEPTH, Kind.INVERSE_DEPTH, Kind.NORMALS}  # their padding has no value
+
+
+def _no_pixels(kind: type[Task]) -> str | None:
+    """Of a sample that is all padding, no term is there: a loss of 0 would call it solved."""
+    model, recipe = _model(kind).train(), load_recipe(RECIPE)
+    samples = open_samples(recipe, model.tasks, "train", _root(), training=True)
+    kinds, read = samples.dataset.fields, samples.dataset.read
+    valued = sorted(name for name in kind.needs & kinds.keys() if kinds[name] not in _BLANK)
+    if valued:
+        return f"not tried: padding has a value in {', '.join(valued)}"
+
+    def padding(name: str) -> DecodedFrame:
+        frame = read(name)
+        fields = {
+            key: torch.full_like(value, OUTSIDE_OF.get(kinds[key], 0))
+            for key, value in frame.fields.items()
+        }
+        outside = torch.full(frame.images_N3HW[0].shape[-2:], OUTSIDE, dtype=torch.int32)
+        return replace(frame, fields=fields, static=outside)
+
+    samples.dataset.read = padding  # type: ignore[method-assign]
+    for task in model.tasks:
+        task.begin(samples.dataset)
+    batch = next(train_batches(samples, 2, seed=0))
+    found = _own(model, kind).losses(model(batch).maps[kind.name], batch)
+    if found:
+        raise ValueError(
+            f"a sample without a valid pixel has the terms {', '.join(found)}: leave out a term "
+            f"that has no pixels"
+        )
+    return None
+
+
 def _results(model: Model, batch: Batch) -> dict[str, Results]:
     with evaluating(model), torch.inference_mode():
         return predict(model, batch, model.tasks, true_size(batch))
@@ -147,6 +183,7 @@ def _near(a: Tensor, b: Tensor) -> bool:
 TASK_CHECKS: dict[str, Callable[[type[Task]], str | None]] = {
     "declared": lambda kind: _declared(kind),
     "losses train it": _on_built_in(_losses),
+    "no pixels, no terms": _on_built_in(_no_pixels),
     "metrics have its columns": _on_built_in(_measures),
     "frames alone and together": _on_built_in(_batched),
 }

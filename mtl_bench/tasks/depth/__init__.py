@@ -171,19 +171,20 @@ class Depth(Task):
         inverse_SB1HW = [full(maps[_map(scale)]) for scale in loss.scales]
         clean_B3HW, mask_BHW = full(fields["clean"]), fields["reprojection_mask"]
         assert batch.camera is not None
-        return {
-            "photometric": photometric_loss(
-                clean_B3HW,
-                full(fields["clean_neighbours"]),
-                inverse_SB1HW,
-                full(batch.camera.K_B33),
-                mask_BHW,
-                full(maps["transforms"]),
-                ssim_weight=loss.ssim_weight,
-                automask=loss.automask,
-            ),
-            "smoothness": smoothness_loss(inverse_SB1HW, loss.scales, clean_B3HW, mask_BHW),
-        }
+        photometric = photometric_loss(
+            clean_B3HW,
+            full(fields["clean_neighbours"]),
+            inverse_SB1HW,
+            full(batch.camera.K_B33),
+            mask_BHW,
+            full(maps["transforms"]),
+            ssim_weight=loss.ssim_weight,
+            automask=loss.automask,
+        )
+        if photometric is None:  # smoothness alone, which only regularises it, wants a flat world
+            return {}
+        smoothness = smoothness_loss(inverse_SB1HW, loss.scales, clean_B3HW, mask_BHW)
+        return {"photometric": photometric, "smoothness": smoothness}
 
     def training_protocol(self, dataset: Dataset) -> dict[str, Any]:
         """What kept the sky and the ego vehicle out of the photometric loss."""

@@ -25,7 +25,7 @@ def photometric_loss(
     *,
     ssim_weight: float = 0.85,
     automask: bool = True,
-) -> Tensor:
+) -> Tensor | None:
     """Smallest error per pixel among the warped context frames, averaged over pixels and scales.
 
     Godard et al., "Digging into self-supervised monocular depth estimation" (ICCV 2019), as in
@@ -39,7 +39,8 @@ def photometric_loss(
       vehicle or the sky, which do not move, would say that the pixel does not either.
     - Out of view, the border's pixels stand in: black ones would reach into the view through SSIM's
       window and push the depth of the image's edge away.
-    - The mean over scales, where the paper writes a sum (its public code: the mean).
+    - The mean over scales, where the paper writes a sum (its public code: the mean). A scale at
+      which no pixel counts is in no mean; where none is left, there is no loss.
 
     Args:
         inverse_SB1HW: one inverse depth a scale, all at full resolution.
@@ -53,7 +54,7 @@ def photometric_loss(
     if automask:
         with torch.no_grad():
             unwarped_BHW = torch.stack([error_of(frame_B3HW) for frame_B3HW in contexts]).amin(0)
-    total = target_B3HW.new_zeros(())
+    total, scales = target_B3HW.new_zeros(()), target_B3HW.new_zeros((), dtype=torch.int64)
     for inverse_B1HW in inverse_SB1HW:
         depth_B1HW = geometry.depth_from_inverse(inverse_B1HW)
         errors, valids = [], []
@@ -68,8 +69,10 @@ def photometric_loss(
         if unwarped_BHW is not None:
             error_BHW = torch.where(error_BHW < unwarped_BHW, error_BHW, unwarped_BHW)
         counts_BHW = torch.stack(valids).any(0) & inside_BHW
-        total = total + error_BHW.masked_fill(~counts_BHW, 0).sum() / counts_BHW.sum().clamp(min=1)
-    return total / len(inverse_SB1HW)
+        number = counts_BHW.sum()
+        total = total + error_BHW.masked_fill(~counts_BHW, 0).sum() / number.clamp(min=1)
+        scales += number > 0
+    return total / int(scales) if scales > 0 else None
 
 
 def _erode(mask_BHW: Tensor) -> Tensor:

@@ -20,12 +20,12 @@ from mtl_bench.core.dataset import LabelFrames
 from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet, class_of_instance_id
 from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
-from mtl_bench.core.terms import Term
+from mtl_bench.core.terms import Term, present
 from mtl_bench.model.layers import Decoder, Head, full, init_fan_in
 from mtl_bench.tasks.panoptic import grouping, pseudo_labels
 from mtl_bench.tasks.panoptic.files import read_ids, write_panoptic
 from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_loss
-from mtl_bench.tasks.panoptic.metrics import PanopticQuality, SemanticIoU
+from mtl_bench.tasks.panoptic.metrics import PanopticQuality, SemanticIoU, runs
 from mtl_bench.tasks.panoptic.picture import PanopticView
 from mtl_bench.tasks.panoptic.targets import panoptic_targets
 from mtl_bench.tasks.pixels import sampled
@@ -169,15 +169,17 @@ class Panoptic(Task):
             return {}
         top = self.recipe.loss.top_fraction
         weight = full(true["semantic_weight"])
-        return {
-            "semantic": semantic_loss(full(maps["semantic"]), true["semantic"], weight, top),
-            "center": center_loss(
-                full(maps["center"]), full(true["center"]), full(true["center_weight"])
-            ),
-            "offset": offset_loss(
-                full(maps["offset"]), full(true["offset"]), full(true["offset_weight"])
-            ),
-        }
+        return present(
+            {
+                "semantic": semantic_loss(full(maps["semantic"]), true["semantic"], weight, top),
+                "center": center_loss(
+                    full(maps["center"]), full(true["center"]), full(true["center_weight"])
+                ),
+                "offset": offset_loss(
+                    full(maps["offset"]), full(true["offset"]), full(true["offset_weight"])
+                ),
+            }
+        )
 
     # --- results ----------------------------------------------------------------------------------
 
@@ -291,14 +293,17 @@ class PanopticMetric(Metric):
 
     def update(self, truth: Frame, result: Frame) -> Frame:
         self.frames += 1
-        ids_HW = grouping.to_instance_ids(torch.as_tensor(result["panoptic"]), self.labels).numpy()
-        if "instance_ids" not in truth:
-            return {"instance_ids": ids_HW}
+        true = [truth["instance_ids"]] if "instance_ids" in truth else []
+        panoptic_HW = result["panoptic"]
+        (panoptic_R, class_R, *true_R), length_R = runs(panoptic_HW, result["class"], *true)
+        ids_R = grouping.to_instance_ids(torch.from_numpy(panoptic_R), self.labels).numpy()
+        shown = {"instance_ids": np.repeat(ids_R, length_R).reshape(panoptic_HW.shape)}
+        if not true:
+            return shown
         self.with_truth += 1
-        true_HW = truth["instance_ids"]
-        pq = self.quality.update(ids_HW, true_HW).pq
-        self.iou.update(result["class"], class_of_instance_id(self.labels)[true_HW])
-        return {"instance_ids": ids_HW, "true_instance_ids": true_HW, "pq": pq}
+        pq = self.quality.update(ids_R, true_R[0], length_R).pq
+        self.iou.update(class_R, class_of_instance_id(self.labels)[true_R[0]], length_R)
+        return {**shown, "true_instance_ids": true[0], "pq": pq}
 
     def state(self) -> dict[str, NDArray[Any]]:
         counts = np.array([self.frames, self.with_truth])

@@ -138,13 +138,12 @@ def to_instance_ids(panoptic_BHW: Tensor, labels: LabelSet) -> Tensor:
 
     A thing pixel without an instance keeps its bare label id: one segment of its class.
     """
-    table = [label.label_id if label.evaluated else 0 for label in labels.labels]
-    label_of_class = torch.tensor([*table, 0], device=panoptic_BHW.device)
-    instance_BHW = panoptic_BHW % DIVISOR
-    index_BHW = torch.where(panoptic_BHW == VOID, len(labels), panoptic_BHW // DIVISOR)
-    label_BHW = label_of_class[index_BHW.long()]
-    numbered_BHW = (instance_BHW > 0) & (label_BHW > 0)
-    return torch.where(numbered_BHW, label_BHW * DIVISOR + instance_BHW, label_BHW).int()
+    label_of_class = [label.label_id if label.evaluated else 0 for label in labels.labels]
+    label_C1 = torch.tensor(label_of_class, dtype=torch.int32)[:, None]
+    id_CN = torch.where(label_C1 > 0, label_C1 * DIVISOR + torch.arange(DIVISOR).int(), 0)
+    id_CN[:, :1] = label_C1
+    id_V = torch.cat([id_CN.new_zeros(-VOID), id_CN.flatten()]).to(panoptic_BHW.device)
+    return id_V.index_select(0, panoptic_BHW.flatten() - VOID).view_as(panoptic_BHW)
 
 
 def _stuff(class_BHW: Tensor, things: tuple[int, ...], least: int) -> Tensor:

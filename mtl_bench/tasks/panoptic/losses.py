@@ -9,7 +9,7 @@ from mtl_bench.core.labels import IGNORE
 
 def semantic_loss(
     logits_BCHW: Tensor, target_BHW: Tensor, weight_BHW: Tensor, top_fraction: float
-) -> Tensor:
+) -> Tensor | None:
     """Weighted cross-entropy of the K hardest valid pixels of the batch, divided by K.
 
     Yang et al., "DeeperLab" (2019), as in MGNet's paper: `-1/K sum_i w_i [p_i < t_K] log p_i`.
@@ -26,19 +26,19 @@ def semantic_loss(
     valid_BHW = (target_BHW != IGNORE) & (weight_BHW > 0)
     loss_N, weight_N = loss_BHW[valid_BHW], weight_BHW[valid_BHW]
     if not len(loss_N):
-        return (logits_BCHW * 0.0).sum()
+        return None
     k = max(1, round(top_fraction * len(loss_N)))
     with torch.no_grad():
         kept_N = loss_N >= loss_N.topk(k, sorted=False).values.min()
     return (loss_N * weight_N * kept_N).sum() / kept_N.sum()
 
 
-def center_loss(center_B1HW: Tensor, target_B1HW: Tensor, weight_B1HW: Tensor) -> Tensor:
+def center_loss(center_B1HW: Tensor, target_B1HW: Tensor, weight_B1HW: Tensor) -> Tensor | None:
     """Squared error of the heat map, averaged with these weights."""
     return _mean((center_B1HW - target_B1HW).square(), weight_B1HW)
 
 
-def offset_loss(offset_B2HW: Tensor, target_B2HW: Tensor, weight_B1HW: Tensor) -> Tensor:
+def offset_loss(offset_B2HW: Tensor, target_B2HW: Tensor, weight_B1HW: Tensor) -> Tensor | None:
     """|dy| + |dx| in pixels, averaged over pixels with these weights.
 
     MGNet's normaliser: twice the value of Panoptic-DeepLab, which averages over both coordinates.
@@ -46,7 +46,7 @@ def offset_loss(offset_B2HW: Tensor, target_B2HW: Tensor, weight_B1HW: Tensor) -
     return _mean((offset_B2HW - target_B2HW).abs().sum(1, keepdim=True), weight_B1HW)
 
 
-def _mean(error_B1HW: Tensor, weight_B1HW: Tensor) -> Tensor:
-    """Weighted mean, an exact zero in the graph where no pixel counts."""
+def _mean(error_B1HW: Tensor, weight_B1HW: Tensor) -> Tensor | None:
+    """Weighted mean; None where no pixel counts."""
     weight = weight_B1HW.sum()
-    return (error_B1HW * weight_B1HW).sum() / torch.where(weight > 0, weight, 1.0)
+    return (error_B1HW * weight_B1HW).sum() / weight if weight > 0 else None

@@ -37,7 +37,8 @@ class Normals(Task):
         return {"normals": normals_of(sample.fields["depth_m"][None], sample.camera.K_B33[None])[0]}
 
     def losses(self, maps, batch):
-        return {"angle": (1 - cosine(maps["normals"].float(), batch.fields["normals"])).mean()}
+        cosine_N = cosine(maps["normals"].float(), batch.fields["normals"])
+        return {"angle": (1 - cosine_N).mean()} if len(cosine_N) else {}
 
     def finish(self, maps, camera, done, size=None):
         if size not in (None, tuple(maps["normals"].shape[2:])):
