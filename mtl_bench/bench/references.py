@@ -68,6 +68,13 @@ def baseline_row(grid: Grid, row: Mapping[str, Any], runs: Path) -> dict[str, An
     return stored if "metric" in stored else None
 
 
+def baseline_rows(grid: Grid, runs: Path) -> list[dict[str, Any]]:
+    """The stored rows that deltas of the grid's rows are against."""
+    cells = {cell.id: cell for cell in (baseline_cell(c, grid.baseline) for c in grid.cells)}
+    own = {cell.id for cell in grid.cells}
+    return store.rows([cell for id_, cell in cells.items() if id_ not in own], runs)
+
+
 def quality(grid: Grid, runs: Path) -> list[dict[str, Any]]:
     """Done rows of the grid whose quality stands beside the speed, every seed that there is."""
     named = grid.quality

@@ -173,8 +173,10 @@ def report(
         typer.Option(
             "--table",
             metavar="NAME",
-            help="cityscapes or kitti: the paper's comparison with the rows of --grid, or of all "
-            "cells in --runs, among the published ones; in place of a grid's report.",
+            help="Published rows, and beside them those of --grid or of all cells in --runs; in "
+            "place of a grid's report. cityscapes, kitti: the paper's comparisons. nyuv2, "
+            "cityscapes2, celeba, nyuv2-deeplab, cityscapes2-deeplab: what the field compares "
+            "methods on.",
             show_default=False,
         ),
     ] = None,
@@ -385,7 +387,7 @@ def _write_table(name: str, choice: Choice | None, runs: Path, reports: Path, sm
     Raises:
         ValueError: no such table, or a damaged row.
     """
-    from mtl_bench.bench import store
+    from mtl_bench.bench import references, store
     from mtl_bench.report import literature
 
     known = literature.load(name)
@@ -393,7 +395,10 @@ def _write_table(name: str, choice: Choice | None, runs: Path, reports: Path, sm
         rows = store.all_rows(runs)
         command = shlex.join(["mtl-bench", "report", "--table", name, *["--smoke"] * smoke])
     else:
-        rows = store.rows(choice.load().cells, runs)
+        grid = choice.load()
+        rows = store.rows(grid.cells, runs)
+        if known.has_deltas and grid.baseline:
+            rows += references.baseline_rows(grid, runs)
         command = choice.command.replace("ablate", f"report --table {name}", 1)
     table = literature.compare(known, rows, smoke)
     page = literature.write(table, reports / f"tables-{name}{'-smoke' * smoke}", command)

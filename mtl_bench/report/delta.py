@@ -3,6 +3,7 @@
 Each seed is compared with its own baseline, and the table then takes mean and spread over seeds.
 """
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,16 +26,34 @@ def counted(rows: Sequence[Row]) -> list[Column]:
 
 
 def with_delta(
-    rows: Sequence[Row], baseline_of: Callable[[Row], Row | None]
+    rows: Sequence[Row],
+    baseline_of: Callable[[Row], Row | None],
+    metrics: Sequence[Column] = (),
 ) -> list[dict[str, Any]]:
     """Copies of rows with `delta.flat`, `.task` and `.gain` among their metrics, in percent.
 
     A row has none where its baseline is missing or itself (0 by definition, no finding), where one
     of the two lacks a metric, where the baseline has a 0 (no change relative to it exists), and
     where only the baseline's code is older or only one of the two is a smoke run.
+
+    Args:
+        metrics: what counts; none: what the tasks declare.
     """
-    metrics = counted(rows)
+    metrics = metrics or counted(rows)
     return [_with_delta(row, baseline_of(row), metrics) for row in rows]
+
+
+def with_single_task_delta(
+    rows: Sequence[Row], metrics: Sequence[Column] = ()
+) -> list[dict[str, Any]]:
+    """The same, against the single-task row among them whose cell differs in the method only."""
+    single = {_but_the_method(row): row for row in rows if row["cell"].get("single_task")}
+    return with_delta(rows, lambda row: single.get(_but_the_method(row)), metrics)
+
+
+def _but_the_method(row: Row) -> str:
+    method = ("method", "method_args", "granularity", "single_task")
+    return json.dumps({k: v for k, v in row["cell"].items() if k not in method}, sort_keys=True)
 
 
 def _with_delta(row: Row, baseline: Row | None, metrics: Sequence[Column]) -> dict[str, Any]:

@@ -47,7 +47,7 @@ from mtl_bench.report.table import (
     single,
     write,
 )
-from mtl_bench.report.verdicts import forest, judge, notes, section
+from mtl_bench.report.verdicts import Verdicts, forest, judge, notes, section
 
 PUBLISHED = Path(__file__).parent / "literature.toml"
 AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
@@ -432,9 +432,12 @@ def build(
     has_section = baseline is None or "metric" in baseline
     rows = [*rows, *_skipped(grid)]
     results = tabulate(rows, layout, baseline if has_section else {"metric": baseline})
+    judged = judge(rows, layout.rows, layout.control) if layout.control is not None else None
     with beside(out_dir, known.figures()) as folder:
         captions = {} if layout.only else _draw(results, folder, runs_root)
-        _write(grid, rows, results, captions, folder, command)
+        if judged is not None:
+            captions["forest"] = forest(judged, folder, "forest")
+        _write(grid, rows, results, judged, captions, folder, command)
     return out_dir / PAGE
 
 
@@ -442,14 +445,14 @@ def _write(
     grid: Any,
     rows: Sequence[Row],
     results: Results,
+    judged: Verdicts | None,
     captions: dict[str, str | None],
     folder: Path,
     command: str,
 ) -> None:
     wide = known.figures() if len(results.groups) > MANY else WIDE
     table = fill(results)
-    if layout.control is not None and (judged := judge(rows, layout.rows, layout.control)):
-        captions["forest"] = forest(judged, out_dir, "forest")
+    if judged is not None:
         table = replace(
             table,
             sections=(*table.sections, section(judged)),

@@ -1,11 +1,13 @@
-"""Measured rows among those that the paper compares itself with: who stands where, and why.
+"""Measured rows beside published ones: who stands where, and why.
 
-Only what was measured on the data set itself, by a protocol of the table and on all of its frames
-is sorted among the published rows. Rows of other protocols or of fewer frames, and rows of the
-built-in data, stand in sections of their own and say so.
+Where a table has a column to sort by, what was measured on the data set itself, by a protocol of
+the table and on all of its frames is sorted among the published rows. In a table without one,
+nothing is: published rows stand as in the file, so that two papers that disagree about a method are
+neighbours, and measured rows have a section of their own. Rows of other protocols or of fewer
+frames, and rows of the built-in data, stand apart and say so.
 
-The paper's tables are `literature/*.toml`: what is printed, and its source. Numbers stay as printed
-(63.05, 63 and 5.240): `Decimal` keeps their digits.
+The tables are `literature/*.toml`: what is printed, and its source. Numbers stay as printed (63.05,
+63 and 5.240): `Decimal` keeps their digits. Multi-task deltas are recomputed from them.
 """
 
 import math
@@ -23,7 +25,9 @@ from markupsafe import Markup
 from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.config import load_recipe, recipe_names, to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
-from mtl_bench.report.columns import Row, flatten, measured, text
+from mtl_bench.evaluate.delta import delta_flat, delta_task
+from mtl_bench.report.columns import DELTA, Row, flatten, measured, text
+from mtl_bench.report.delta import with_single_task_delta
 from mtl_bench.report.page import PAGE, Page, beside, render
 from mtl_bench.report.statistics import (
     KNOWN,
@@ -44,6 +48,7 @@ from mtl_bench.report.table import (
     Table,
     TableRow,
     latex,
+    number,
     numbers,
     tex,
 )
@@ -58,8 +63,12 @@ TEXTS = {  # columns of words: their titles
     "device": "Device",
     "protocol": "Protocol",
     "frames": "Frames",
+    "printed_in": "Printed in",
+    "rerun_by": "Run again by",
 }
 COST = (Column("runtime_ms", "latency.mean_ms", "Runtime", -1, 1, "ms", part="cost"), FPS)
+PRECISE = tuple(replace(column, digits=2) for column in DELTA)
+PUBLISHED = -1  # the section of published rows, where measured ones are not sorted among them
 LONG = 46  # characters of a method with its details: longer ones are broken in LaTeX
 UNNEEDED = re.compile(r"\((R|TM)\)| Processor\b| CPU\b(?= )")  # of a device's name
 FULL_FRAME = "full-frame"  # rows from before protocols had names
@@ -77,19 +86,23 @@ class Scaling:
 
 @dataclass(frozen=True)
 class Literature:
-    """One table of the paper, and what may stand beside it."""
+    """One table of published rows, and what may stand beside it."""
 
     name: str  # of the data set, as one writes it
     title: str
-    label: str  # of the table in the paper's source
     source: str
     datasets: tuple[str, ...]  # of cells measured on it
     built_in: tuple[str, ...]  # of cells measured on rendered scenes in its layout
     split: str
     frames: int  # of the split, as papers report it
-    columns: tuple[str, ...]  # of TEXTS, `number` and COST, in their order
+    columns: tuple[str, ...]  # of TEXTS, `number`, COST and DELTA, in their order
     narrow: tuple[str, ...]  # those that fit on a page of a paper
-    sort: str  # the column
+    sort: str = ""  # the column; none: published and measured rows stand apart
+    label: str = ""  # of the table in the MGNet paper's source
+    baseline: str = ""  # method of the row that published deltas are against
+    printed_delta: str = ""  # which of DELTA `delta_printed` is
+    published: Mapping[str, str] = field(default_factory=dict)  # words of every published row
+    papers: Mapping[str, str] = field(default_factory=dict)  # as `printed_in` names them
     data: str = ""  # what the column of training images says of measured rows
     protocols: tuple[str, ...] = ()  # that the table compares; none: no scaling in it
     width_first: bool = False  # how a size is written
@@ -98,13 +111,24 @@ class Literature:
     symbols: Mapping[str, str] = field(default_factory=dict)  # behind a method: what it says
     number: tuple[Column, ...] = ()  # {scaled} in a key is a scaling's place
     scaling: tuple[Scaling, ...] = (Scaling(),)
-    row: tuple[Mapping[str, Any], ...] = ()  # columns, details, source; symbols, note, printed_as
+    # columns, details, source; symbols, note, printed_as; n, se (by column), read_in, and what is
+    # wrong with it: differs (the delta from the row's numbers), copied (it is another row's)
+    row: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def numbers(self) -> dict[str, Column]:
         """Those of `columns`, by name, in their order."""
-        known = {column.name: column for column in (*self.number, *COST)}
+        known = {column.name: column for column in (*self.number, *COST, *PRECISE)}
         return {name: known[name] for name in self.columns if name in known}
+
+    @property
+    def has_deltas(self) -> bool:
+        return any(column.name in self.columns for column in DELTA)
+
+    @property
+    def counted(self) -> list[Column]:
+        """Those that deltas are made of."""
+        return [column for column in self.number if column.in_delta]
 
 
 def names() -> list[str]:
@@ -135,6 +159,7 @@ class Line:
     entries: Mapping[str, Entry]  # columns of numbers
     details: str  # behind the method: venue, or what else the cells are
     count: int = 0  # seeds
+    errors: Mapping[str, str] = field(default_factory=dict)  # a published row's standard errors
     marks: tuple[str, ...] = ()  # what a reader must know before the numbers
     printed: Mapping[str, str] = field(default_factory=dict)  # a published row's numbers
     symbols: str = ""
@@ -186,18 +211,25 @@ def compare(literature: Literature, rows: Sequence[Row], smoke: bool = False) ->
         smoke: smoke rows alone, in place of all others.
     """
     wanted = (*literature.datasets, *literature.built_in)
-    own = [row for row in rows if dataset_of(row) in wanted and row.get("status") in SHOWN]
+    own: Sequence[Row] = [
+        row for row in rows if dataset_of(row) in wanted and row.get("status") in SHOWN
+    ]
+    if literature.has_deltas:
+        own = with_single_task_delta(own, literature.counted)
     chosen = [row for row in own if bool(row.get("smoke")) is smoke]
     lines = [*_published(literature), *_measured(literature, chosen)]
     name = literature.name
-    headings = (
-        f"Published, and measured on {name} by the table's protocol",
-        f"Measured on {name}, not comparable with the above",
-        f"Measured on the built-in data, not on {name}",
-    )
+    headings = {
+        PUBLISHED: "Published",
+        0: f"Published, and measured on {name} by the table's protocol",
+        1: f"Measured on {name}, not comparable with the above",
+        2: f"Measured on the built-in data, not on {name}",
+    }
+    if not literature.sort:
+        headings[0] = f"Measured on {name}, on the frames of the published rows"
     parts = tuple(
         Part(heading, tuple(_sorted(literature, [l_ for l_ in lines if l_.place == place])))
-        for place, heading in enumerate(headings)
+        for place, heading in headings.items()
     )
     found = Comparison(literature, tuple(part for part in parts if part.lines), ())
     left_out = sum(bool(row.get("smoke")) for row in own) if not smoke else 0
@@ -210,6 +242,8 @@ def dataset_of(row: Row) -> Any:
 
 def _sorted(literature: Literature, lines: Sequence[Line]) -> list[Line]:
     """Best first; equals stay in their order, and what has no value comes last."""
+    if not literature.sort:
+        return list(lines)
     better = literature.numbers[literature.sort].better
 
     def rank(line: Line) -> tuple[bool, float]:
@@ -221,7 +255,8 @@ def _sorted(literature: Literature, lines: Sequence[Line]) -> list[Line]:
 
 def _notes(found: Comparison, left_out: int) -> Iterator[str]:
     literature, lines = found.literature, found.lines
-    yield f"Published rows as printed in {literature.source}; they have no n and no spread."
+    spread = "n and standard errors as far as printed" if literature.papers else "no n, no spread"
+    yield f"Published rows as printed in {literature.source}; {spread}."
     yield from literature.notes
     for symbol, meaning in literature.symbols.items():
         yield f"{symbol} {meaning}"
@@ -230,9 +265,8 @@ def _notes(found: Comparison, left_out: int) -> Iterator[str]:
         yield "No measured row: no finished cell belongs to this table."
     else:
         yield (
-            "Measured rows: mean +- sample standard deviation over n seeds; speed at batch 1 with "
-            "all tasks of the cell, transfer and post-processing, in PyTorch without an optimizing "
-            "engine. Nothing is bold: a published number has no spread to lead by."
+            f"Measured rows: mean +- sample standard deviation over n seeds{_speed(literature)}. "
+            "Nothing is bold: a published number has no spread to lead by."
         )
     if any(line.place == 2 for line in lines):
         yield f"Built-in data: rendered scenes, whose numbers say nothing of {literature.name}."
@@ -241,21 +275,59 @@ def _notes(found: Comparison, left_out: int) -> Iterator[str]:
         yield f"{left_out} {rows} left out; --smoke shows them, apart and marked."
 
 
+def _speed(literature: Literature) -> str:
+    if not any(column.name in literature.columns for column in COST):
+        return ""
+    return (
+        "; speed at batch 1 with all tasks of the cell, transfer and post-processing, in PyTorch "
+        "without an optimizing engine"
+    )
+
+
 def _published(literature: Literature) -> list[Line]:
     known = literature.numbers
-    return [
-        Line(
-            kind="published",
-            texts={k: str(v) for k, v in row.items() if k in TEXTS},
-            entries={k: Entry(float(v), count=1) for k, v in row.items() if k in known},
-            printed={k: str(v) for k, v in row.items() if k in known},
-            details=row["details"],
-            symbols=row.get("symbols", ""),
-            source=row["source"],
-            note=row.get("note", ""),
+    lines = []
+    for row in literature.row:
+        computed = deltas(literature, row)
+        values = {**row, **{k: number(v, known[k]) for k, v in computed.items() if k in known}}
+        printed = {k: str(v) for k, v in values.items() if k in known}
+        exact = {**{k: float(v) for k, v in row.items() if k in known}, **computed}
+        wrong = {"copied": "copy error", "differs": "printed \u0394 is not the row's"}
+        marks = [f"{said}: {row[key]}" for key, said in wrong.items() if key in row]
+        paper = str(row.get("printed_in", ""))
+        read = f" (read in {row['read_in']})" if "read_in" in row else ""
+        words = {**literature.published, **row, "printed_in": paper + read}
+        lines.append(
+            Line(
+                kind="published",
+                texts={k: str(v) for k, v in words.items() if k in TEXTS},
+                entries={k: Entry(exact[k], count=1) for k in printed},
+                printed=printed,
+                errors={k: str(v) for k, v in row.get("se", {}).items()},
+                details=row.get("details", ""),
+                count=row.get("n", 0),
+                marks=tuple(marks),
+                symbols=row.get("symbols", ""),
+                source=row.get("source") or literature.papers[paper.split(",")[0]],
+                note=row.get("note", ""),
+                place=0 if literature.sort else PUBLISHED,
+            )
         )
-        for row in literature.row
-    ]
+    return lines
+
+
+def deltas(literature: Literature, row: Mapping[str, Any]) -> dict[str, float]:
+    """Both deltas of a published row, from its numbers as printed; {} where it lacks one."""
+    columns = literature.counted
+    base = next((r for r in literature.row if r["method"] == literature.baseline), row)
+    if base["method"] == row["method"] or not all(column.name in row for column in columns):
+        return {}
+    own, other = ({c.name: float(r[c.name]) for c in columns} for r in (row, base))
+    upward = {column.name: column.better > 0 for column in columns}
+    return {
+        "delta_flat": delta_flat(own, other, upward),
+        "delta_task": delta_task(own, other, upward, {c.name: c.task for c in columns}),
+    }
 
 
 # --- what was measured ----------------------------------------------------------------------------
@@ -275,7 +347,8 @@ def _measured(literature: Literature, rows: Sequence[Row]) -> Iterator[Line]:
             for prefix, about in _protocols(group):
                 for scaling in literature.scaling:
                     line = _line(literature, group, prefix, about, scaling)
-                    if line.entries[literature.sort].count:
+                    shown = [literature.sort] if literature.sort else line.entries
+                    if any(line.entries[name].count for name in shown):
                         yield replace(line, details=details)
                 if not literature.protocols:
                     break
@@ -311,7 +384,9 @@ def _line(
         kind="measured",
         texts={
             **_texts(literature, group.rows),
-            "protocol": f"{about['name']}, {scaling.name}",
+            "protocol": f"{about['name']}, {scaling.name}"
+            if literature.protocols
+            else _training(group.rows[0]),
             "frames": _text(frames) if built_in else f"{_text(frames)}/{all_frames}",
         },
         entries={c.name: _entry(group.rows, c, scaled) for c in literature.numbers.values()},
@@ -335,7 +410,7 @@ def _texts(literature: Literature, rows: Sequence[Row]) -> dict[str, str]:
         if "latency.device" in row.get("metric", {})
     )
     elsewhere = [f"at {_size(timed, literature)}"] * (bool(timed) and timed != list(size))
-    threads = [f"{metric['latency.threads']} threads"] * ("latency.threads" in metric)
+    threads = [f"{metric[k]} threads" for k in ("latency.threads",) if k in metric]
     return {
         "method": str(cell.get("method")),
         "backbone": str(cell.get("backbone")),
@@ -343,6 +418,11 @@ def _texts(literature: Literature, rows: Sequence[Row]) -> dict[str, str]:
         "data": "built-in" if dataset_of(rows[0]) in literature.built_in else literature.data,
         "device": ", ".join([" or ".join(devices), *threads, *elsewhere]) if devices else NOTHING,
     }
+
+
+def _training(row: Row) -> str:
+    cell = cell_of(row)
+    return f"{cell.get('recipe.optim.steps')} steps of {cell.get('recipe.optim.batch')}, the last"
 
 
 def _details(group: Group, axes: Sequence[str], literature: Literature) -> str:
@@ -407,7 +487,8 @@ def fill(found: Comparison, narrow: bool = False) -> Table:
         notes=found.notes,
         records=tuple(_records(found, every)),
         title=literature.title,
-        sources=tuple(dict.fromkeys(f"{r['method']}: {r['source']}." for r in literature.row)),
+        sources=tuple(f"{name}: {citation}." for name, citation in literature.papers.items())
+        or tuple(dict.fromkeys(f"{r['method']}: {r['source']}." for r in literature.row)),
         joined=True,
         letters={letter: meaning for meaning, letter in letters.items()},
     )
@@ -430,8 +511,9 @@ def cell(line: Line, name: str, known: Mapping[str, Column]) -> Cell:
     if name in TEXTS:
         return Cell(line.texts.get(name, NOTHING))
     if line.kind == "published":
-        entry = line.entries.get(name)
-        return Cell(line.printed.get(name, NOTHING), value=entry.mean if entry else None)
+        entry, error = line.entries.get(name), line.errors.get(name)
+        spread = f"(SE {error})" if error else ""
+        return Cell(line.printed.get(name, NOTHING), spread, value=entry.mean if entry else None)
     return Cell.of(line.entries[name], known[name], line.count)
 
 
@@ -448,7 +530,7 @@ def _method(line: Line) -> Cell:
     if len(line.texts["method"] + line.details) > LONG:
         small = rf"\parbox[t]{{17em}}{{\raggedright {small}\strut}}"
     html = Markup("{} <small>{}</small>").format(name, line.details)
-    return Cell(f"{name} ({line.details})", html=html, tex=small)
+    return Cell(f"{name} ({line.details})" if line.details else name, html=html, tex=small)
 
 
 def _origin(line: Line, letters: Mapping[str, str], shown: Sequence[str]) -> Cell:
@@ -484,6 +566,7 @@ def _records(found: Comparison, shown: Sequence[str]) -> Iterator[dict[str, Any]
                     values[name] = line.texts.get(name, "")
                 else:
                     values |= numbers(line.entries, [found.literature.numbers[name]])
+            values |= {f"{name}_se": error for name, error in line.errors.items()}
             yield values | {"n": line.count, "note": line.note, "source": line.source}
 
 

@@ -1,0 +1,158 @@
+"""Methods of 2024 and later: values worked out by hand, and identities.
+
+Shapes: T losses of the method, K of them given, P parameters.
+"""
+
+import itertools
+import math
+import sys
+
+import pytest
+import torch
+from support.methods import head_weights, step_of, weights
+from support.terms import TERMS
+
+from mtl_bench.core import plugins
+from mtl_bench.core.terms import Term
+
+F64 = torch.float64
+
+
+def make(name, tasks=2, **settings):
+    terms = [Term(f"task{i}", "depth", "regression", 1.0) for i in range(tasks)]
+    return plugins.load("methods", name)(terms, **settings)
+
+
+def losses(*values):
+    return torch.tensor(values, dtype=F64)
+
+
+# --- GO4Align -------------------------------------------------------------------------------------
+
+
+def test_go4align_of_a_group_each_is_mean_over_loss_times_the_smooth_share():
+    method = make("go4align", 2, groups=2, beta=math.log(3) / 2)
+    # q = (1/2 3^(-1/2), 1/2 3^(-3/2)) over their sum: 3/4 and 1/4; the mean loss is 2
+    expected = losses(3 / 4 * 2 / 1, 1 / 4 * 2 / 3)
+    torch.testing.assert_close(weights(method, losses(1.0, 3.0)), expected)
+    # once more: 9/10 and 1/10
+    expected = losses(9 / 10 * 2 / 1, 1 / 10 * 2 / 3)
+    torch.testing.assert_close(weights(method, losses(1.0, 3.0)), expected)
+
+
+def test_go4align_of_one_group_is_the_mean_indicator():
+    method = make("go4align", 3, groups=1, beta=0.0)
+    mean = 7 / 3
+    indicator = mean * (1 + 1 / 2 + 1 / 4) / 3 / 3
+    torch.testing.assert_close(
+        weights(method, losses(1, 2, 4)), torch.full((3,), indicator, dtype=F64)
+    )
+
+
+def test_go4align_puts_the_two_near_ones_together():
+    method = make("go4align", 3, groups=2, beta=0.0)
+    weight_K = weights(method, losses(1.0, 10.0, 11.0))
+    mean = 22 / 3
+    together = (mean / 10 + mean / 11) / 2 / 3
+    torch.testing.assert_close(weight_K, losses(mean / 3, together, together))
+
+
+def test_go4align_with_beta_0_and_a_group_each_is_parallel_to_the_sum_of_logarithms():
+    loss_K = losses(0.2, 3.0, 40.0, 500.0)
+    ours = weights(make("go4align", 4, groups=4, beta=0.0), loss_K)
+    other = weights(make("scale_invariant", 4), loss_K)
+    torch.testing.assert_close(ours / ours.sum(), other / other.sum())
+
+
+@pytest.mark.parametrize("groups", [1, 2, 3])
+def test_the_groups_are_the_best_of_all(groups):
+    centres = sys.modules[plugins.load("methods", "go4align").__module__].centres
+    generator = torch.Generator().manual_seed(groups)
+    for _ in range(3):
+        value_K = torch.randn(5, generator=generator, dtype=F64).exp()
+        least = math.inf
+        for labels in itertools.product(range(groups), repeat=5):
+            label_K = torch.tensor(labels)
+            found_K = torch.stack([value_K[label_K == label].mean() for label in label_K])
+            least = min(least, float((value_K - found_K).square().sum()))
+        ours_K = centres(value_K, groups)
+        assert float((value_K - ours_K).square().sum()) == pytest.approx(least)
+        assert len(ours_K.unique()) == groups
+    torch.testing.assert_close(centres(value_K, groups + 5), value_K)  # empty groups do no harm
+
+
+def test_go4align_wants_a_group():
+    with pytest.raises(ValueError, match="groups 0 must be at least 1, beta"):
+        make("go4align", groups=0)
+
+
+# --- NTKMTL ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["ntkmtl", "ntkmtl_sr"])
+def test_ntkmtl_by_hand(name):
+    G_KK = torch.tensor([[9.0, 2.0], [2.0, 16.0]], dtype=F64)
+    method = make(name)
+    weight_K = method.weights(G_KK, step_of(losses(1, 1)))
+    torch.testing.assert_close(weight_K, losses(math.sqrt(12.5) / 3, math.sqrt(12.5) / 4))
+    torch.testing.assert_close(head_weights(method, weight_K, losses(1, 1)), weight_K)
+
+
+def test_ntkmtl_makes_all_kernels_equally_large_and_keeps_their_mean():
+    J_KP = torch.randn(5, 20, generator=torch.Generator().manual_seed(1), dtype=F64)
+    J_KP *= torch.logspace(-3, 3, 5, dtype=F64)[:, None]
+    weight_K = make("ntkmtl", 5).weights(J_KP @ J_KP.T, step_of(torch.ones(5, dtype=F64)))
+    square_K = (weight_K[:, None] * J_KP).square().sum(1)
+    torch.testing.assert_close(square_K, J_KP.square().sum(1).mean().expand(5))
+
+
+def test_ntkmtl_leaves_a_zero_gradient_out():
+    G_KK = torch.diag(losses(9.0, 0.0, 16.0))
+    weight_K = make("ntkmtl", 3).weights(G_KK, step_of(losses(1, 1, 1)))
+    torch.testing.assert_close(weight_K, losses(math.sqrt(12.5) / 3, 1.0, math.sqrt(12.5) / 4))
+
+
+# --- LDC-MTL --------------------------------------------------------------------------------------
+
+
+def test_ldc_by_hand():
+    method = make("ldc", lam=0.1, normalize="none")
+    loss_K = torch.tensor([1.0, 3.0], requires_grad=True)
+    total = method.total(step_of(loss_K))
+    assert total.item() == pytest.approx((1 + 3) / 2 + 0.1 * (3 - 1))
+    total.backward()
+    torch.testing.assert_close(loss_K.grad, torch.tensor([0.5 - 0.1, 0.5 + 0.1]))
+    # d/da_i sum_j s_j l_j = s_i (l_i - sum_j s_j l_j)
+    torch.testing.assert_close(method.logit_T.grad, torch.tensor([0.5 * (1 - 2), 0.5 * (3 - 2)]))
+
+
+def test_ldc_with_weighted_levels_moves_its_weights_towards_equal_levels():
+    method = make("ldc", lam=1.0, tau="weights", normalize="none")
+    method.total(step_of(torch.tensor([1.0, 3.0]))).backward()
+    # beside the sum's -1/2: the level 3 s_2 - s_1 has the derivative -3 s_1 s_2 - s_1 s_2 = -1
+    torch.testing.assert_close(method.logit_T.grad, torch.tensor([-1.5, 1.5]))
+
+
+def test_ldcs_penalty_is_the_mean_of_the_papers_over_all_orders():
+    values = [0.3, 1.0, 2.5, 4.0]
+    ours = make("ldc", 4, normalize="none", lam=1.0).total(step_of(torch.tensor(values))).item()
+    adjacent = [
+        sum(abs(a - b) for a, b in itertools.pairwise(order))
+        for order in itertools.permutations(values)
+    ]
+    assert ours == pytest.approx(sum(values) / 4 + sum(adjacent) / len(adjacent))
+
+
+def test_ldc_counts_losses_from_their_first_value():
+    method = make("ldc", lam=0.1)
+    first = weights(method, torch.tensor([1.0, 300.0]))
+    torch.testing.assert_close(
+        first, torch.tensor([0.5, 0.5 / 300])
+    )  # both levels are 1: no penalty
+    later = weights(method, torch.tensor([1.0, 150.0]))
+    torch.testing.assert_close(later, torch.tensor([0.5 + 0.1, (0.5 - 0.1) / 300]))
+
+
+def test_ldc_names_what_it_does_not_know():
+    with pytest.raises(ValueError, match="tau 'two' is not one of one, weights"):
+        plugins.load("methods", "ldc")(TERMS, tau="two")
