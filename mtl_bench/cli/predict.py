@@ -108,7 +108,10 @@ def predict(
     plugins: o.PluginsOption = None,
     quiet: o.QuietOption = False,
 ) -> None:
-    """Predict images or a video: panoptic overlay, depth, ids and point cloud, or a video of it."""
+    """Predict images or a video: panoptic overlay, depth, ids and point cloud, or a video of it.
+
+    What cannot be predicted is listed at the end and in prediction.json; the exit code is 1 then.
+    """
     from mtl_bench.show.predict import job as predictions
     from mtl_bench.show.predict.cameras import Given
 
@@ -130,6 +133,10 @@ def predict(
         for line in predictions.summary(record, predictor):
             typer.echo(line)
         typer.echo(f"{record['frames']} frames, {record['fps']:.1f} FPS: {out}")
+    for failure in record["failed"]:
+        typer.echo(f"not predicted: {failure['why']}", err=True)
+    if record["failed"]:
+        raise typer.Exit(1)
 
 
 def _predictor(checkpoint: Path, size: tuple[int, int] | None, device: o.Device) -> "Predictor":

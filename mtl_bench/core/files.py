@@ -9,6 +9,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 
+def is_litter(name: str) -> bool:
+    """Whether a file or folder is an operating system's own, or hidden, in a folder of data."""
+    return name.startswith(".") or name in ("Thumbs.db", "desktop.ini", "__MACOSX", "@eaDir")
+
+
 @contextlib.contextmanager
 def replacing(path: Path, synced: bool = True) -> Iterator[BinaryIO]:
     """A file to write, which appears under its name when the block ends, and not if it fails.

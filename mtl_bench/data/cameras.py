@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.files import is_litter
 from mtl_bench.data import cityscapes_files as cityscapes
 from mtl_bench.data import kitti_files as kitti
 
@@ -49,8 +50,9 @@ def of_layout(path: Path, size: tuple[int, int]) -> Mounted | None:
 @functools.lru_cache(4)
 def _names_in(cameras: Path) -> frozenset[str]:
     """Frames that have a camera file in this folder."""
-    files = cameras.glob(f"*{cityscapes.CAMERA.suffix}")
-    return frozenset(file.name.removesuffix(cityscapes.CAMERA.suffix) for file in files)
+    names = (file.name for file in cameras.glob(f"*{cityscapes.CAMERA.suffix}"))
+    own = (name for name in names if not is_litter(name))
+    return frozenset(name.removesuffix(cityscapes.CAMERA.suffix) for name in own)
 
 
 def from_json(path: Path) -> Mounted:

@@ -10,7 +10,7 @@ from mtl_bench.core.dataset import NEIGHBOURS
 from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Task
 from mtl_bench.data import cityscapes_files as files
-from mtl_bench.data import png
+from mtl_bench.data import pictures, png
 from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE, Kind
 
 PUBLISHED_FRAMES = {"train": 2975, "val": 500, "test": 1525}  # of the real Cityscapes
@@ -192,7 +192,7 @@ def _check_ego_mask(report: Report, names: list[str]) -> None:
     image_path = files.file_of(report.root / IMAGE.folder / "train", IMAGE, names[0])
     try:
         size = files.read_ego_mask(path).shape
-        image = png.read_header(image_path)
+        image = pictures.read_header(image_path)
         files.check_same_size(path, size, image_path, (image.height, image.width))
     except ValueError as error:
         if not any(str(problem) == str(error) for problem in report.problems):
@@ -209,10 +209,12 @@ def _check_file(path: Path, kind: Kind, deep: bool) -> tuple[int, int] | None:
         files.read_camera(path)
         return None
     assert kind.bits is not None
-    header = png.read_header(path)
+    header = pictures.read_header(path)
     png.check_bits(path, header, kind.bits)
     if deep and kind is LABELS:
         files.read_instance_ids(path)
+    elif deep and kind.bits == 8:
+        pictures.read(path, kind.bits)
     elif deep:
-        png.read(path, kind.bits, color=kind.bits == 8)
+        png.read(path, kind.bits)
     return header.height, header.width

@@ -14,7 +14,7 @@ from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Task
 from mtl_bench.data import kitti_files as files
 from mtl_bench.data import kitti_splits as splits
-from mtl_bench.data import png, velodyne
+from mtl_bench.data import pictures, png, velodyne
 from mtl_bench.data.cityscapes_files import check_same_size, read_instance_ids
 from mtl_bench.data.kitti import PSEUDO_LABEL, check_calibrated
 from mtl_bench.data.kitti_splits import Frame
@@ -220,7 +220,7 @@ def _check_frame(
             if kind == "scan":
                 velodyne.check_length(path, path.stat().st_size)
                 continue
-            header = png.read_header(path)
+            header = pictures.read_header(path)
             png.check_bits(path, header, _BITS[kind])
             size = (header.height, header.width)
             if camera and kind == "image":
@@ -229,8 +229,10 @@ def _check_frame(
                 check_same_size(path, size, image, camera.size)
             if deep and kind == "label file":
                 read_instance_ids(path)
+            elif deep and kind == "image":
+                pictures.read(path, _BITS[kind])
             elif deep:
-                png.read(path, _BITS[kind], color=kind == "image")
+                png.read(path, _BITS[kind])
         except ValueError as error:
             report.problems.append(Problem(kind, str(error)))
 

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.files import is_litter
 from mtl_bench.core.labels import DIVISOR, LARGEST_ID
-from mtl_bench.data import png
+from mtl_bench.data import pictures, png
 from mtl_bench.data.labels import KNOWN_LABEL_IDS
 
 
@@ -79,11 +80,12 @@ def names_in(folder: Path, kind: Kind) -> set[str]:
     if not folder.is_dir():
         return set()
     try:
-        cities = [city for city in os.scandir(folder) if city.is_dir()]
+        cities = [c for c in os.scandir(folder) if c.is_dir() and not is_litter(c.name)]
         files = [file.name for city in cities for file in os.scandir(city)]
     except OSError as error:
         raise ValueError(f"{error.filename}: cannot be listed ({error.strerror})") from error
-    return {name.removesuffix(kind.suffix) for name in files if name.endswith(kind.suffix)}
+    names = (name for name in files if name.endswith(kind.suffix) and not is_litter(name))
+    return {name.removesuffix(kind.suffix) for name in names}
 
 
 def annotated_names(root: Path, split: str) -> list[str]:
@@ -191,7 +193,7 @@ def read_camera(path: Path) -> Camera:
 
 def read_image(path: Path) -> NDArray[np.uint8]:
     """[H,W,3] RGB."""
-    return png.read(path, 8, color=True)
+    return pictures.read(path, bits=8)
 
 
 def read_instance_ids(path: Path) -> NDArray[np.uint16]:
