@@ -45,7 +45,7 @@ class DecodedFrame:
     """What is kept of a decoded frame; everything random comes later."""
 
     images_N3HW: Sequence[Tensor]  # uint8, input size; in training followed by previous and next
-    K_33: Tensor | None = None
+    K_33: Tensor | None = None  # not known
     camera_height_m: float = 0.0
     camera_pitch_rad: float = 0.0
     # By name; at the input's size in training, at their own in evaluation
@@ -245,6 +245,11 @@ class Dataset:
     def described(self) -> dict[str, Any]:
         """What a row says of the training frames."""
         return {}
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether what is asked for takes the frames' intrinsics: all does but labels alone."""
+        return not self.needs or any(self.fields.get(name) is not Kind.IDS for name in self.needs)
 
     def __len__(self) -> int:
         return len(self.names)

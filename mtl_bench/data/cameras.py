@@ -34,7 +34,7 @@ def of_layout(path: Path, size: tuple[int, int]) -> Mounted | None:
     path = path.resolve()
     for folder in path.parents:
         if folder.name in (cityscapes.IMAGE.folder, cityscapes.SEQUENCE.folder):
-            name = path.name.removesuffix(cityscapes.IMAGE.suffix)
+            name = path.stem.removesuffix(Path(cityscapes.IMAGE.suffix).stem)
             cameras = folder.parent / cityscapes.CAMERA.folder / path.relative_to(folder).parent
             if not cameras.is_dir():
                 return None

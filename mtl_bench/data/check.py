@@ -15,11 +15,11 @@ from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SE
 
 PUBLISHED_FRAMES = {"train": 2975, "val": 500, "test": 1525}  # of the real Cityscapes
 # What a run needs of every annotated frame: which split, which fields
-NEEDS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "panoptic training": ("train", ("instance_ids",)),
-    "depth training": ("train", (NEIGHBOURS,)),
-    "panoptic evaluation": ("val", ("instance_ids",)),
-    "depth evaluation": ("val", ("depth_m",)),
+NEEDS: dict[str, tuple[str, set[str]]] = {
+    "panoptic training": ("train", {"instance_ids"}),
+    "depth training": ("train", {NEIGHBOURS}),
+    "panoptic evaluation": ("val", {"instance_ids"}),
+    "depth evaluation": ("val", {"depth_m"}),
 }
 _FILES = {"instance_ids": LABELS, "depth_m": DISPARITY, NEIGHBOURS: SEQUENCE}  # fields are from
 _KINDS = (IMAGE, LABELS, SEQUENCE, CAMERA, DISPARITY)
@@ -63,7 +63,8 @@ class Report:
 
     def _lack(self, split: str, fields: Collection[str]) -> str | None:
         """What of these fields a split lacks."""
-        kinds = (IMAGE, CAMERA, *(_FILES[name] for name in sorted(fields)))
+        kinds = (IMAGE, *(_FILES[name] for name in sorted(fields)))
+        kinds += () if fields == {"instance_ids"} else (CAMERA,)  # as `Dataset.needs_camera`
         if not self.frames.get(split):
             return f"no frames in {IMAGE.folder}/{split}"
         for kind in kinds:

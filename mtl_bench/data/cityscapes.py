@@ -134,8 +134,12 @@ class Cityscapes(Dataset):
         if self._compares:
             around = [self._file(SEQUENCE, files.neighbour(name, step)) for step in (-1, 1)]
             images += [self.on_disk.read(beside, frame_cache.IMAGE, frame) for beside in around]
-        camera = files.read_camera(self._file(CAMERA, self._camera_names[name]))
-        K = torch.tensor([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
+        camera = K_33 = None
+        camera_path = self._file(CAMERA, self._camera_names[name])
+        if self.needs_camera or camera_path.exists():
+            camera = files.read_camera(camera_path)
+            K = torch.tensor([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
+            K_33 = scale(K, self.data.width / own_size[1], self.data.height / own_size[0])
 
         fields: dict[str, torch.Tensor] = {}
         wanted = "instance_ids" in self.needs
@@ -155,6 +159,7 @@ class Cityscapes(Dataset):
         if ids_HW is not None and (wanted or not self.training):
             fields["instance_ids"] = ids_HW
         if "depth_m" in self.needs:
+            assert camera is not None
             depth_path = self._file(DISPARITY, name)
             depth_m = files.read_depth_m(depth_path, camera)
             files.check_same_size(depth_path, depth_m.shape, *frame)
@@ -164,9 +169,9 @@ class Cityscapes(Dataset):
 
         return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
-            K_33=scale(K, self.data.width / own_size[1], self.data.height / own_size[0]),
-            camera_height_m=camera.height_m,
-            camera_pitch_rad=camera.pitch_rad,
+            K_33=K_33,
+            camera_height_m=camera.height_m if camera else 0.0,
+            camera_pitch_rad=camera.pitch_rad if camera else 0.0,
             fields=fields,
             static=ids_HW if self.training else None,
         )
@@ -222,7 +227,7 @@ class Cityscapes(Dataset):
         return cameras
 
     def _require_files(self) -> None:
-        needed = [(CAMERA, set(self._camera_names.values()))]
+        needed = [(CAMERA, set(self._camera_names.values()))] if self.needs_camera else []
         if "instance_ids" in self.needs:
             needed.append((LABELS, set(self.names)))
         if self._compares:

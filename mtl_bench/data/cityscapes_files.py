@@ -31,14 +31,16 @@ class Kind:
     suffix: str
     what: str  # in a sentence: "3 frames lack their ..."
     bits: int | None = None  # of a PNG
+    also: str | None = None  # another suffix that files may have
 
     @property
     def package(self) -> str:
         return f"{self.folder}_trainvaltest.zip"
 
 
-IMAGE = Kind("leftImg8bit", "_leftImg8bit.png", "image", 8)
-SEQUENCE = Kind("leftImg8bit_sequence", "_leftImg8bit.png", "neighbour frame", 8)
+_PNG, _JPEG = "_leftImg8bit.png", "_leftImg8bit.jpg"  # as distributed; as converted
+IMAGE = Kind("leftImg8bit", _PNG, "image", 8, _JPEG)
+SEQUENCE = Kind("leftImg8bit_sequence", _PNG, "neighbour frame", 8, _JPEG)
 LABELS = Kind("gtFine", "_gtFine_instanceIds.png", "label file", 16)
 DISPARITY = Kind("disparity", "_disparity.png", "disparity map", 16)
 CAMERA = Kind("camera", "_camera.json", "camera file")
@@ -72,7 +74,11 @@ def neighbour(name: str, step: int) -> str:
 
 def file_of(folder: Path, kind: Kind, name: str) -> Path:
     """A frame's file of a kind; the folder is `<root>/<kind.folder>/<split>`."""
-    return folder / name.rsplit("_", 2)[0] / f"{name}{kind.suffix}"
+    path = folder / name.rsplit("_", 2)[0] / f"{name}{kind.suffix}"
+    if kind.also and not path.exists():
+        other = path.with_name(f"{name}{kind.also}")
+        return other if other.exists() else path
+    return path
 
 
 def names_in(folder: Path, kind: Kind) -> set[str]:
@@ -84,8 +90,9 @@ def names_in(folder: Path, kind: Kind) -> set[str]:
         files = [file.name for city in cities for file in os.scandir(city)]
     except OSError as error:
         raise ValueError(f"{error.filename}: cannot be listed ({error.strerror})") from error
-    names = (name for name in files if name.endswith(kind.suffix) and not is_litter(name))
-    return {name.removesuffix(kind.suffix) for name in names}
+    names = [name for name in files if not is_litter(name)]
+    endings = (kind.suffix, kind.also or kind.suffix)
+    return {name.removesuffix(end) for end in endings for name in names if name.endswith(end)}
 
 
 def annotated_names(root: Path, split: str) -> list[str]:

@@ -40,6 +40,11 @@ TRUTHS = {
     "improved": ("improved",),
     "velodyne": ("velodyne",),
 }
+PACKAGES = {
+    "improved": f"{files.DEPTH_PACKAGE}.zip into it or beside it",
+    "velodyne": "the drives' velodyne_points",
+}
+PROTOCOLS = {"improved": "eigen-improved", "velodyne": "eigen-raw"}  # that measure on them
 PSEUDO_LABEL = "mtl-bench pseudo-label --checkpoint CITYSCAPES_RUN --data"
 
 
@@ -102,6 +107,7 @@ class Kitti(Dataset):
         self._cameras = {
             (date, camera): files.read_camera(root / date, camera)
             for date, camera in {(frame.date, frame.camera) for frame in frames}
+            if self.needs_camera or files.is_calibrated(root / date)
         }
 
     @classmethod
@@ -221,11 +227,13 @@ class Kitti(Dataset):
         self.truth_counts = Counter(self._truth.values())
         self._leave_out("without depth maps", len(frames) - len(self._truth))
         if not self._truth:
-            wanted = " or ".join(TRUTHS[truth])
+            wanted = TRUTHS[truth]
+            others = {kind: sum(map(has[kind], frames)) for kind in has if kind not in wanted}
+            hints = [f"unpack {PACKAGES[kind]}" for kind in wanted]
+            hints += [other_protocol(kind, count) for kind, count in others.items() if count]
             raise ValueError(
                 f"{self.root}: none of its {len(frames)} frames of {self.split} has a depth map "
-                f"({wanted}); unpack {files.DEPTH_PACKAGE}.zip into it, or the drives' "
-                f"velodyne_points"
+                f"({' or '.join(wanted)}); {', or '.join(hints)}"
             )
         return list(self._truth)
 
@@ -243,10 +251,14 @@ class Kitti(Dataset):
     def read(self, name: str) -> DecodedFrame:
         frame = self._frames[name]
         path = self.tree.image(frame)
-        camera = self._cameras[frame.date, frame.camera]
+        camera = self._cameras.get((frame.date, frame.camera))
         images = [self.on_disk.read(path, frame_cache.IMAGE)]
-        check_calibrated(path, images[0].own_size, camera)
-        size = camera.size
+        size = (images[0].own_size[0], images[0].own_size[1])
+        K_33 = None
+        if camera is not None:
+            check_calibrated(path, size, camera)
+            K = torch.from_numpy(camera.K_33).float()
+            K_33 = scale(K, self.data.width / size[1], self.data.height / size[0])
         if self._compares:
             around = [self.tree.image(frame.later(step)) for step in (-1, 1)]
             whole = (path, size)
@@ -257,14 +269,14 @@ class Kitti(Dataset):
         if ids_HW is not None and ("instance_ids" in self.needs or not self.training):
             fields["instance_ids"] = ids_HW
         if "depth_m" in self.needs:
+            assert camera is not None
             depth_m = self._read_depth_m(frame, path, camera)
             if self.training:
                 depth_m = self._to_input(depth_m, path, cv2.INTER_NEAREST_EXACT)
             fields["depth_m"] = torch.from_numpy(depth_m)
-        K_33 = torch.from_numpy(camera.K_33).float()
         return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
-            K_33=scale(K_33, self.data.width / size[1], self.data.height / size[0]),
+            K_33=K_33,
             camera_height_m=files.CAMERA_HEIGHT_M,
             fields=fields,
             static=ids_HW if self.training else None,
@@ -300,6 +312,14 @@ class Kitti(Dataset):
 
     def _to_input(self, array: NDArray[Any], path: Path, interpolation: int) -> NDArray[Any]:
         return to_size(array, self.data.height, self.data.width, interpolation)
+
+
+def other_protocol(truth: str, count: int) -> str:
+    """What to set where these depth maps are there, and those that were asked for are not."""
+    return (
+        f"measure on the {truth} maps that {count} frames have: "
+        f"--set recipe.evaluate.protocol={PROTOCOLS[truth]} --set recipe.evaluate.also=[]"
+    )
 
 
 def check_calibrated(path: Path, size: tuple[int, ...], camera: files.Camera) -> None:

@@ -44,17 +44,18 @@ def read(path: Path, bits: int | None = None) -> NDArray[np.uint8]:
     """[H,W,3] RGB.
 
     Args:
-        bits: a PNG of another depth is refused; None: it is turned into 8 bits.
+        bits: a PNG of another depth is refused, as is what only claims to be a PNG; None: any
+            image is turned into 8 bits.
 
     Raises:
         ValueError: the file is missing, cut off, damaged or no image.
     """
     data = png.read_bytes(path)
-    if data.startswith(png.SIGNATURE):
+    if data.startswith(png.SIGNATURE) or (bits and path.suffix == ".png"):
         png.check(path, data, bits)
     else:
         _check_whole(path, data)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError(f"{path}: not an image that OpenCV can read, or a damaged one")
     return np.ascontiguousarray(image[..., ::-1])
@@ -77,6 +78,8 @@ def read_header(path: Path) -> png.Header:
 
 def _check_whole(path: Path, data: bytes) -> None:
     """Raises: ValueError where Pillow, which knows most kinds, finds that something is missing."""
+    if not data:
+        raise ValueError(f"{path}: the file is empty")
     try:
         image = PIL.Image.open(io.BytesIO(data))
         image.draft("RGB", (1, 1))  # a JPEG is read to its end, but most of it not worked out
