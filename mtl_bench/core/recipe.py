@@ -5,6 +5,8 @@ Frozen dataclasses with the paper's values as defaults; `recipes/*.toml` name wh
 
 from dataclasses import dataclass, field
 
+NOTHING = "none"  # as the split of an evaluation
+
 
 @dataclass(frozen=True)
 class Data:
@@ -19,6 +21,8 @@ class Data:
     frames: int = 3  # synthetic only: length of a snippet; the video stage needs 4 or more
     seed: int = 0  # synthetic only: which world
     train_frames: str = "published"  # KITTI only: published (the split's) | all (with neighbours)
+    stride: int = 1  # frames from a training frame to its neighbours in time, on both sides
+    min_flow: float = 0.0  # pixels; training frames that move less against neighbours are left out
     cache: bool = True  # keep decoded frames in memory
     workers: int = 0  # data-loading processes; 0 = in the training process
 
@@ -97,7 +101,7 @@ class PseudoLabels:
 class Evaluate:
     """Post-processing and protocol of the metrics."""
 
-    split: str = "val"
+    split: str = "val"  # none: nothing is measured, as where there is no truth
     center_threshold: float = 0.3
     nms_kernel: int = 7  # pixels
     top_k: int = 200  # centers kept; the paper gives none
@@ -108,6 +112,11 @@ class Evaluate:
     protocol: str = "full-frame"  # of the depth metrics; see `tasks/depth/protocols.py`
     also: tuple[str, ...] = ()  # further protocols; their metrics' keys begin with their names
     flip: bool = False  # inverse depth averaged with that of the mirrored image
+
+    @property
+    def images(self) -> str:
+        """The split whose images are timed: the training's where nothing is measured."""
+        return "train" if self.split == NOTHING else self.split
 
 
 @dataclass(frozen=True)

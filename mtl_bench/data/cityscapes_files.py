@@ -115,12 +115,14 @@ def annotated_names(root: Path, split: str) -> list[str]:
     return names
 
 
-def with_neighbours(names: set[str], present: set[str]) -> set[str]:
-    """Those of the names whose previous and next frames are present, too."""
-    return {name for name in names if {neighbour(name, -1), neighbour(name, 1)} <= present}
+def with_neighbours(names: set[str], present: set[str], stride: int = 1) -> set[str]:
+    """Those of the names whose neighbours, so many frames away, are present, too."""
+    return {
+        name for name in names if {neighbour(name, -stride), neighbour(name, stride)} <= present
+    }
 
 
-def unlabelled_names(root: Path, split: str) -> list[str]:
+def unlabelled_names(root: Path, split: str, stride: int = 1) -> list[str]:
     """Frames that pseudo labels can be made for, sorted.
 
     They have no label file, but a camera (their own or their annotated frame's) and both neighbours
@@ -130,7 +132,7 @@ def unlabelled_names(root: Path, split: str) -> list[str]:
     labelled = names_in(root / LABELS.folder / split, LABELS)
     sequences = {split_name(name)[:2] for name in annotated_names(root, split)}
     own = {name for name in present - labelled if split_name(name)[:2] in sequences}
-    return sorted(with_neighbours(own, present))
+    return sorted(with_neighbours(own, present, stride))
 
 
 def camera_names(annotated: Set[str], names: Set[str]) -> dict[str, str]:

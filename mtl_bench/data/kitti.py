@@ -31,6 +31,7 @@ from mtl_bench.data.cityscapes_files import (
 from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.kitti_splits import Frame
 from mtl_bench.data.labels import CITYSCAPES19
+from mtl_bench.data.motion import moving
 from mtl_bench.data.png import to_size
 from mtl_bench.data.pseudo_frames import KittiFrames
 
@@ -95,6 +96,8 @@ class Kitti(Dataset):
         self.tree = files.Tree(root)
         self.left_out: Counter[str] = Counter()
         frames = self._present()
+        if self._compares and data.min_flow > 0:
+            frames = self._moving(frames)
         if "depth_m" in self.needs:
             frames = self._with_truth(frames, truth)
         self._frames = {frame.name: frame for frame in frames}
@@ -166,7 +169,7 @@ class Kitti(Dataset):
         """The files that samples are made of and that `on_disk` can hold."""
         frames = set(self._frames.values())
         if self._compares:
-            frames |= {frame.later(step) for frame in frames for step in (-1, 1)}
+            frames |= {beside for frame in frames for beside in self._around(frame)}
         sources = [(self.tree.image(frame), frame_cache.IMAGE) for frame in sorted(frames)]
         labels = [
             (path, frame_cache.LABELS) for path in self._label_files.values() if self.training
@@ -190,11 +193,28 @@ class Kitti(Dataset):
             self._leave_out("absent", len(wanted) - len(present))
         frames = present
         if self.split == "train":
-            frames = [frame for frame in present if self.tree.has_neighbours(frame)]
+            frames = [
+                frame for frame in present if self.tree.has_neighbours(frame, self.data.stride)
+            ]
             self._leave_out("without neighbours", len(present) - len(frames))
         if not frames:
             raise ValueError(self._nothing(choice))
         return frames
+
+    def _around(self, frame: Frame) -> list[Frame]:
+        """The frame before and the one after."""
+        return [frame.later(step) for step in (-self.data.stride, self.data.stride)]
+
+    def _moving(self, frames: list[Frame]) -> list[Frame]:
+        pairs = {}
+        for frame in frames:
+            before, image, after = map(self.tree.image, sorted([frame, *self._around(frame)]))
+            pairs[frame.name] = ((before, image), (image, after))
+        kept = set(
+            moving(pairs, self.data, lambda p: self.on_disk.read(p, frame_cache.IMAGE).pixels)
+        )
+        self._leave_out("standing", len(frames) - len(kept))
+        return [frame for frame in frames if frame.name in kept]
 
     def _of_no_list(self, *others: str) -> list[Frame]:
         kept = {frame for split in others for frame in splits.frames_of(self.root, split)}
@@ -206,6 +226,8 @@ class Kitti(Dataset):
 
     def _nothing(self, choice: str) -> str:
         see = f"see 'mtl-bench data check {self.root}'"
+        if self.left_out["without neighbours"] and self.data.stride > 1:
+            see = f"lower recipe.data.stride = {self.data.stride}, or {see}"
         if self.split == "train" and choice == "all":
             return f"{self.root}: no frame to train on that has both neighbours; {see}"
         advice = f"unpack the drives that have them, {see}"
@@ -260,7 +282,7 @@ class Kitti(Dataset):
             K = torch.from_numpy(camera.K_33).float()
             K_33 = scale(K, self.data.width / size[1], self.data.height / size[0])
         if self._compares:
-            around = [self.tree.image(frame.later(step)) for step in (-1, 1)]
+            around = [self.tree.image(beside) for beside in self._around(frame)]
             whole = (path, size)
             images += [self.on_disk.read(beside, frame_cache.IMAGE, whole) for beside in around]
         fields: dict[str, torch.Tensor] = {}

@@ -117,8 +117,8 @@ class Tree:
     def has_improved(self, frame: Frame) -> bool:
         return frame.number in self._files(frame, self.improved)
 
-    def has_neighbours(self, frame: Frame) -> bool:
-        return all(self.has_image(frame.later(step)) for step in (-1, 1))
+    def has_neighbours(self, frame: Frame, stride: int = 1) -> bool:
+        return all(self.has_image(frame.later(step)) for step in (-stride, stride))
 
     @property
     def predicted_labels(self) -> bool:

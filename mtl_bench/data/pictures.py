@@ -17,8 +17,10 @@ from mtl_bench.data import png
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm", ".jp2")
 _LONGEST = 12  # bytes of the beginnings
-_BEGINNINGS = (png.SIGNATURE, b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  ")
-_BEGINNINGS += tuple(b"P%d" % kind for kind in range(1, 7))
+_BEGINNINGS = (
+    *(png.SIGNATURE, b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*", b"\0\0\0\x0cjP  "),
+    *(b"P%d" % kind for kind in range(1, 7)),
+)
 
 # Of what is wrong with a file, one line of ours is enough
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

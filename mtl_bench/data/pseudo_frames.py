@@ -39,7 +39,7 @@ class CityscapesFrames:
         self.source, self.out = root / SEQUENCE.folder / split, out
         self.folder = out / LABELS.folder / split
         self.size = (recipe.data.height, recipe.data.width)
-        self.names = files.unlabelled_names(root, split)
+        self.names = files.unlabelled_names(root, split, recipe.data.stride)
         if not self.names:
             raise ValueError(
                 f"{self.source}: no frame without a human label that has both neighbours; unpack "
