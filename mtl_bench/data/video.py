@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.files import utf8_name
+
 Image = NDArray[np.uint8]
 CODEC = "mp4v"  # MPEG-4, which every OpenCV can write
 UNKNOWN_FPS = 25.0  # of a video that does not say
@@ -30,18 +32,6 @@ def representable(fps: float) -> float:
     )
 
 
-def _opencv_name(path: Path) -> str:
-    """Raises: ValueError: a name that OpenCV would crash at."""
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        raise ValueError(
-            f"{os.fsencode(path)!r}: OpenCV reads and writes no video whose name is not UTF-8; "
-            f"rename it"
-        ) from None
-    return str(path)
-
-
 class Reader:
     """A video file; iterating decodes a frame at a time.
 
@@ -51,7 +41,7 @@ class Reader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._capture = cv2.VideoCapture(_opencv_name(path))
+        self._capture = cv2.VideoCapture(utf8_name(path, "OpenCV's video"))
         if not self._capture.isOpened():
             raise ValueError(f"{path}: neither an image nor a video that OpenCV can read")
         fps = self._capture.get(cv2.CAP_PROP_FPS)
@@ -84,7 +74,7 @@ class Writer:
 
     def __init__(self, path: Path, fps: float) -> None:
         self.path, self.fps, self.frames = path, representable(fps), 0
-        self._name = _opencv_name(path)
+        self._name = utf8_name(path, "OpenCV's video")
         self._writer: cv2.VideoWriter | None = None
 
     def write(self, image_HW3: Image) -> None:

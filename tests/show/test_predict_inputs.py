@@ -150,6 +150,11 @@ def test_names_that_are_not_utf_8(run, tmp_path):
     for read_or_write in (video.Reader, lambda path: video.Writer(path, 10.0)):
         with pytest.raises(ValueError, match=r"b.xff.mp4': .*is not UTF-8; rename it"):
             read_or_write(folder / "b\udcff.mp4")
+    pytest.importorskip("rerun")
+    result = predict(run, folder, "--out", tmp_path / "c", "--rerun", folder / "c.rrd")
+    assert result.exit_code == 2
+    assert "Rerun reads and writes no file whose name is not UTF-8" in result.stderr
+    assert not (tmp_path / "c").exists()
 
 
 # --- videos ---------------------------------------------------------------------------------------
