@@ -10,9 +10,13 @@ import pytest
 import torch
 from kitti_tree import OTHER_DAY, TEST, TRAIN
 
+from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data import cameras, cityscapes_files
 from mtl_bench.data.check import check
 from mtl_bench.data.check_kitti import check_kitti
+from mtl_bench.evaluate.walk import evaluate
+from mtl_bench.model import build_model
 
 LITTER = b"\0\5\x16\7 Mac OS X"
 
@@ -118,6 +122,15 @@ def test_labels_alone_need_no_camera(city, kitti, tmp_path):
     report = check(city)
     assert report.obstacle("panoptic training") is None
     assert report.obstacle("depth training") == "no camera/train; unpack camera_trainvaltest.zip"
+
+
+def test_a_panoptic_cell_is_evaluated_without_cameras(tmp_path):
+    root = cityscapes_tree.write_tree(tmp_path / "cs", 2, "val", (32, 64))
+    shutil.rmtree(root / "camera")
+    cell = Cell(load_recipe("smoke"), backbone="tiny", method="fixed", tasks=("panoptic",))
+    model = build_model(cell, tasks_of_cell(cell))
+    metrics = evaluate(model, cell, root, torch.device("cpu")).metrics
+    assert 0 <= metrics["panoptic.pq"] <= 1
 
 
 def test_a_message_names_the_protocol_that_would_work(kitti):
