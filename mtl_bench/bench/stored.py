@@ -16,6 +16,7 @@ from mtl_bench.core.config import Cell
 from mtl_bench.core.device import Compute, choose_device
 from mtl_bench.core.files import write_json
 from mtl_bench.core.locks import SIDE_BY_SIDE, Quiet
+from mtl_bench.core.recipe import NOTHING
 from mtl_bench.core.task import Results
 from mtl_bench.data.loader import eval_batches
 from mtl_bench.data.samples import open_samples
@@ -123,7 +124,8 @@ def time_cell(
     those hold still meanwhile.
     """
     recipe = cell.recipe
-    samples = open_samples(recipe, model.tasks, recipe.evaluate.split, root, training=False)
+    measured = model.tasks if recipe.evaluate.split != NOTHING else ()  # else there is no truth
+    samples = open_samples(recipe, measured, recipe.evaluate.images, root, training=False)
     frames = [samples.sample(index, None) for index in range(min(len(samples), FRAMES))]
     camera = collate(frames[:1]).camera
     assert camera is not None

@@ -6,6 +6,7 @@ lists come at once.
 """
 
 import errno
+import io
 import os
 import signal
 import sys
@@ -75,6 +76,8 @@ def main() -> None:
     """The console script; SIGTERM and a closed terminal are interruptions like Ctrl-C."""
     for name, value in SPIN.items():
         os.environ.setdefault(name, value)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as it is
     signal.signal(signal.SIGTERM, _interrupt)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _interrupt)  # under nohup it is ignored, and stays so

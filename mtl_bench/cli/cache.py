@@ -61,14 +61,16 @@ def cache(
 
 def _sources(cell: Cell, root: Path, out: Path | None) -> tuple["FrameCache", list["Source"]]:
     """The cache of the data set, and the files for it."""
+    from mtl_bench.core.recipe import NOTHING
     from mtl_bench.core.task import tasks_of_cell
     from mtl_bench.data.samples import open_samples
 
     recipe, tasks = cell.recipe, tasks_of_cell(cell)
     split = recipe.evaluate.split
     training = open_samples(recipe, tasks, "train", root, training=True).dataset
-    evaluated = open_samples(recipe, tasks, split, root, training=False).dataset
-    sources = training.sources() + evaluated.sources()
+    sources = training.sources()
+    if split != NOTHING:
+        sources += open_samples(recipe, tasks, split, root, training=False).dataset.sources()
     frames = training.on_disk if out is None else training.on_disk.at(out.resolve())
     return frames, list(dict.fromkeys(sources))
 

@@ -2,12 +2,22 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mtl_bench.cli import options as o
-from mtl_bench.core.config import GRANULARITIES, Cell, check_cells, load_recipe, override
+from mtl_bench.core.config import (
+    GRANULARITIES,
+    Cell,
+    check_cells,
+    load_recipe,
+    override,
+    set_values,
+)
+
+if TYPE_CHECKING:
+    from mtl_bench.show.predict.cameras import Given
 
 
 def register(app: typer.Typer) -> None:
@@ -82,6 +92,13 @@ def train(
         ),
     ] = False,
     data: o.DataOption = None,
+    camera: o.CameraOption = None,
+    calib: o.CalibOption = None,
+    fx: o.PixelsOption = None,
+    fy: o.PixelsOption = None,
+    cx: o.PixelsOption = None,
+    cy: o.PixelsOption = None,
+    camera_height: o.HeightOption = None,
     runs: o.RunsOption = Path("runs"),
     device: o.DeviceOption = o.Device.auto,
     wandb: o.WandbOption = o.Wandb.off,
@@ -91,6 +108,8 @@ def train(
     """Train one cell, evaluate it, time it, and write its row.
 
     What it needs is run before: of --video the cell without it, of --single-task one for each task.
+    Depth also trains on a plain video and its camera, --data VIDEO.mp4 --fx ...: nothing is
+    measured then, as there is no truth.
     """
     if cell_file is not None:
         from mtl_bench.bench.jobs import load_cell
@@ -113,6 +132,11 @@ def train(
             granularity=granularity,
             pretrained=weights,
         )
+    given = o.given_camera(camera, calib, (fx, fy, cx, cy), camera_height)
+    if data is not None and data.is_file():
+        cell, data = _filmed(cell, data, given, quiet)
+    elif given != type(given)():
+        raise ValueError("--camera, --calib, --fx ... are for --data VIDEO: a data set has its own")
     cell = override(cell, settings or [])
     if latency:
         _time_again(cell, data, runs, device.value, quiet)
@@ -126,6 +150,28 @@ def train(
     root = o.data_root(cell, data, quiet)
     here = launch.Here(runs, root, device.value, wandb.value, o.echo(quiet))
     here.run(cell, rerun, stale)
+
+
+def _filmed(cell: Cell, video: Path, given: "Given", quiet: bool) -> tuple[Cell, Path]:
+    """A cell that trains on a video, and the folder that its frames are in."""
+    from mtl_bench.data import filmed
+    from mtl_bench.data.video import Reader
+    from mtl_bench.show.predict.cameras import camera_of
+
+    camera = camera_of(video, Reader(video).size, given)
+    if camera.guessed:
+        raise ValueError(
+            f"{video}: training on a video takes its camera's intrinsics: give --fx --fy --cx "
+            f"--cy, --calib or --camera"
+        )
+    with o.bar("decoding frames", quiet) as bar:
+
+        def show(done: int, of: int) -> None:
+            task = bar.task_ids[0] if bar.task_ids else bar.add_task("")
+            bar.update(task, completed=done, total=of or None)
+
+        root = filmed.tree_of(video, camera, progress=show)
+    return set_values(cell, filmed.SETTINGS), root
 
 
 def _time_again(cell: Cell, data: Path | None, runs: Path, device: str, quiet: bool) -> None:

@@ -158,7 +158,7 @@ def _shown(
     from mtl_bench.show import figures
 
     cell = predictors[0].cell
-    files = figures.frames_in(o.any_root(cell, data), split or cell.recipe.evaluate.split)
+    files = figures.frames_in(o.any_root(cell, data), split or cell.recipe.evaluate.images)
     names = [wanted] if isinstance(wanted, str) else wanted or []
     chosen = figures.choose(list(files), names, seed, count)
     return [[figures.look(p, name, files[name]) for p in predictors] for name in chosen]

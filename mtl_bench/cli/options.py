@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from mtl_bench.core.dataset import Dataset
+    from mtl_bench.show.predict.cameras import Given
 
-RUNNING, GRID = "Where and how to run", "Which cells"
+RUNNING, GRID, CAMERA = "Where and how to run", "Which cells", "The camera"
 
 
 class Device(StrEnum):
@@ -57,6 +58,38 @@ DataOption = Annotated[
         help="Root of the data set, in Cityscapes' layout or KITTI raw's. Without it the built-in "
         "scenes are rendered into the user's cache on first use.",
         rich_help_panel=RUNNING,
+        show_default=False,
+    ),
+]
+CameraOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="CAMERA.JSON",
+        help="Intrinsics, height and pitch in Cityscapes' format.",
+        rich_help_panel=CAMERA,
+        show_default=False,
+    ),
+]
+CalibOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="OpenCV's calib.yaml; or KITTI's calib_cam_to_cam.txt: its camera 03 for images in a "
+        "folder image_03, else 02. Lens distortion is not undone: undistort images first.",
+        rich_help_panel=CAMERA,
+        show_default=False,
+    ),
+]
+PixelsOption = Annotated[
+    float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
+]
+HeightOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="M",
+        help="Above the road: depth is in metres then. Where no file knows it either, depth is in "
+        "camera heights.",
+        rich_help_panel=CAMERA,
         show_default=False,
     ),
 ]
@@ -173,6 +206,30 @@ def bar(title: str, quiet: bool, *more: str) -> "Progress":
 def echo(quiet: bool) -> Callable[[str], None]:
     """Prints a line, or does not."""
     return (lambda line: None) if quiet else typer.echo
+
+
+def given_camera(
+    camera: Path | None,
+    calib: Path | None,
+    intrinsics: Sequence[float | None],
+    height_m: float | None,
+) -> "Given":
+    """What the options say of the camera.
+
+    Args:
+        intrinsics: fx, fy, cx, cy.
+
+    Raises:
+        ValueError: some of them and not all, or several sources of them.
+    """
+    from mtl_bench.show.predict.cameras import Given
+
+    known = [value for value in intrinsics if value is not None]
+    if len(known) not in (0, 4):
+        raise ValueError("intrinsics are four numbers: give all of --fx --fy --cx --cy")
+    fx, fy, cx, cy = known or (None,) * 4
+    numbers = None if fx is None or fy is None or cx is None or cy is None else (fx, fy, cx, cy)
+    return Given(camera, calib, numbers, height_m)
 
 
 def weights(pretrained: str | None) -> str | None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mtl_bench.show.predict import Predictor
     from mtl_bench.show.predict.job import Job
 
-CAMERA, OUTPUT = "The camera", "What is written"
+OUTPUT = "What is written"
 
 
 def register(app: typer.Typer) -> None:
@@ -62,57 +62,25 @@ def predict(
             show_default=False,
         ),
     ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="CAMERA.JSON",
-            help="Intrinsics, height and pitch in Cityscapes' format. Without this or the next "
-            "ones: from the data set that the image lies in, else a guess.",
-            rich_help_panel=CAMERA,
-            show_default=False,
-        ),
-    ] = None,
-    calib: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="KITTI's calib_cam_to_cam.txt; camera 03 for images in a folder image_03, else "
-            "02.",
-            rich_help_panel=CAMERA,
-            show_default=False,
-        ),
-    ] = None,
-    fx: Annotated[
-        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
-    ] = None,
-    fy: Annotated[
-        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
-    ] = None,
-    cx: Annotated[
-        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
-    ] = None,
-    cy: Annotated[
-        float | None, typer.Option(help="Pixels.", rich_help_panel=CAMERA, show_default=False)
-    ] = None,
-    camera_height: Annotated[
-        float | None,
-        typer.Option(
-            metavar="M",
-            help="Above the road: depth is in metres then. Where no file knows it either, depth "
-            "is in camera heights.",
-            rich_help_panel=CAMERA,
-            show_default=False,
-        ),
-    ] = None,
+    camera: o.CameraOption = None,
+    calib: o.CalibOption = None,
+    fx: o.PixelsOption = None,
+    fy: o.PixelsOption = None,
+    cx: o.PixelsOption = None,
+    cy: o.PixelsOption = None,
+    camera_height: o.HeightOption = None,
     device: o.DeviceOption = o.Device.auto,
     plugins: o.PluginsOption = None,
     quiet: o.QuietOption = False,
 ) -> None:
-    """Predict images or a video: panoptic overlay, depth, ids and point cloud, or a video of it."""
-    from mtl_bench.show.predict import job as predictions
-    from mtl_bench.show.predict.cameras import Given
+    """Predict images or a video: panoptic overlay, depth, ids and point cloud, or a video of it.
 
-    given = Given(camera, calib, _focal_and_center(fx, fy, cx, cy), camera_height)
+    Without options for the camera it is that of the data set which an image lies in, else a guess.
+    What cannot be predicted is listed at the end and in prediction.json; the exit code is 1 then.
+    """
+    from mtl_bench.show.predict import job as predictions
+
+    given = o.given_camera(camera, calib, (fx, fy, cx, cy), camera_height)
     paths = predictions.find(inputs)
     video = predictions.is_video(paths)
     predictor = _predictor(checkpoint, None if size is None else o.size(size), device)
@@ -130,6 +98,10 @@ def predict(
         for line in predictions.summary(record, predictor):
             typer.echo(line)
         typer.echo(f"{record['frames']} frames, {record['fps']:.1f} FPS: {out}")
+    for failure in record["failed"]:
+        typer.echo(f"not predicted: {failure['why']}", err=True)
+    if record["failed"]:
+        raise typer.Exit(1)
 
 
 def _predictor(checkpoint: Path, size: tuple[int, int] | None, device: o.Device) -> "Predictor":
@@ -163,17 +135,6 @@ def _kinds(what: str | None, video: bool, tasks: tuple[str, ...]) -> list[str]:
         if task_of[kind] not in tasks:
             raise ValueError(f"--what {kind} takes the task {task_of[kind]}, which the cell lacks")
     return kinds
-
-
-def _focal_and_center(
-    fx: float | None, fy: float | None, cx: float | None, cy: float | None
-) -> tuple[float, float, float, float] | None:
-    """Raises: ValueError: some of them and not all."""
-    if fx is None or fy is None or cx is None or cy is None:
-        if (fx, fy, cx, cy) != (None,) * 4:
-            raise ValueError("intrinsics are four numbers: give all of --fx --fy --cx --cy")
-        return None
-    return fx, fy, cx, cy
 
 
 @contextmanager

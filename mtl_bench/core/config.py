@@ -59,6 +59,8 @@ GRANULARITIES = ("terms", "tasks")
 LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("data", "train_frames"),
     ("data", "test_scenes"),
+    ("data", "stride"),
+    ("data", "min_flow"),
     ("evaluate", "protocol"),
     ("evaluate", "also"),
     ("evaluate", "flip"),

@@ -44,8 +44,8 @@ NEIGHBOURS = "neighbours"  # what a task needs that compares a frame with those 
 class DecodedFrame:
     """What is kept of a decoded frame; everything random comes later."""
 
-    images_N3HW: Sequence[Tensor]  # uint8, input size; in training followed by previous and next
-    K_33: Tensor | None = None
+    images_N3HW: Sequence[Tensor]  # uint8, input size; in training then those before and after
+    K_33: Tensor | None = None  # not known
     camera_height_m: float = 0.0
     camera_pitch_rad: float = 0.0
     # By name; at the input's size in training, at their own in evaluation
@@ -159,6 +159,11 @@ class Dataset:
         training: bool = False,
         truth: str = "default",
     ) -> None:
+        if data.stride < 1 or not data.min_flow >= 0:
+            raise ValueError(
+                f"recipe.data.stride = {data.stride} must be 1 or more, recipe.data.min_flow = "
+                f"{data.min_flow:g} 0 or more"
+            )
         self.root, self.split, self.data = root, split, data
         self.needs, self.training, self.truth = frozenset(needs), training, truth
         unknown = self.needs - {NEIGHBOURS} - self.fields.keys()
@@ -245,6 +250,11 @@ class Dataset:
     def described(self) -> dict[str, Any]:
         """What a row says of the training frames."""
         return {}
+
+    @property
+    def needs_camera(self) -> bool:
+        """Whether what is asked for takes the frames' intrinsics: all does but labels alone."""
+        return not self.needs or any(self.fields.get(name) is not Kind.IDS for name in self.needs)
 
     def __len__(self) -> int:
         return len(self.names)

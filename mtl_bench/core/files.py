@@ -9,6 +9,27 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 
+def is_litter(name: str) -> bool:
+    """Whether a file or folder is an operating system's own, or hidden, in a folder of data."""
+    return name.startswith(".") or name in ("Thumbs.db", "desktop.ini", "__MACOSX", "@eaDir")
+
+
+def utf8_name(path: Path, reader: str) -> str:
+    """A path as text for a library in C or Rust.
+
+    Raises:
+        ValueError: a name that is not UTF-8, at which such a library crashes.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise ValueError(
+            f"{os.fsencode(path)!r}: {reader} reads and writes no file whose name is not UTF-8; "
+            f"rename it"
+        ) from None
+    return str(path)
+
+
 @contextlib.contextmanager
 def replacing(path: Path, synced: bool = True) -> Iterator[BinaryIO]:
     """A file to write, which appears under its name when the block ends, and not if it fails.

@@ -26,6 +26,8 @@ Positive = Annotated[float, above(0), FINITE]
 NotNegative = Annotated[float, least(0), FINITE]
 Share = Annotated[float, least(0), most(1)]
 
+NOTHING = "none"  # as the split of an evaluation
+
 
 @dataclass(frozen=True)
 class Data(Checked):
@@ -48,6 +50,10 @@ class Data(Checked):
         one_of("published", "all"),
         "KITTI only: the split's frames, or all that have both neighbours",
     ] = "published"
+    stride: Annotated[Count, "frames from a training frame to its neighbours, on both sides"] = 1
+    min_flow: Annotated[
+        NotNegative, "pixels; training frames that move less against neighbours are left out"
+    ] = 0.0
     cache: Annotated[bool, "keep decoded frames in memory"] = True
     workers: Annotated[Whole, "processes that load data; 0: the training process does"] = 0
 
@@ -153,7 +159,7 @@ class PseudoLabels(Checked):
 class Evaluate(Checked):
     """Post-processing and protocol of the metrics."""
 
-    split: Annotated[str, "which frames: train, val or test"] = "val"
+    split: Annotated[str, "which frames: train, val or test; none: nothing is measured"] = "val"
     center_threshold: Annotated[Share, "least height of an instance's center"] = 0.3
     nms_kernel: Annotated[Count, ODD, "pixels"] = 7
     top_k: Annotated[int, least(1), most(999), "centers kept; an id has three digits for them"] = (
@@ -176,6 +182,11 @@ class Evaluate(Checked):
                 f"recipe.evaluate.min_depth_m = {self.min_depth_m} must be below max_depth_m = "
                 f"{self.max_depth_m}"
             )
+
+    @property
+    def images(self) -> str:
+        """The split whose images are timed: the training's where nothing is measured."""
+        return "train" if self.split == NOTHING else self.split
 
 
 @dataclass(frozen=True)

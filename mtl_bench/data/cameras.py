@@ -1,4 +1,4 @@
-"""Cameras of single images: what the files of Cityscapes and KITTI say, found or named.
+"""Cameras of single images: what files of Cityscapes, KITTI and OpenCV say, found or named.
 
 An image that lies in one of these layouts has its calibration there.
 """
@@ -8,13 +8,16 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.files import is_litter
 from mtl_bench.data import cityscapes_files as cityscapes
 from mtl_bench.data import kitti_files as kitti
 
 KITTI_FILE = "calib_cam_to_cam.txt"
+OPENCV_SUFFIXES = (".yaml", ".yml", ".xml")
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ def of_layout(path: Path, size: tuple[int, int]) -> Mounted | None:
     path = path.resolve()
     for folder in path.parents:
         if folder.name in (cityscapes.IMAGE.folder, cityscapes.SEQUENCE.folder):
-            name = path.name.removesuffix(cityscapes.IMAGE.suffix)
+            name = path.stem.removesuffix(Path(cityscapes.IMAGE.suffix).stem)
             cameras = folder.parent / cityscapes.CAMERA.folder / path.relative_to(folder).parent
             if not cameras.is_dir():
                 return None
@@ -49,8 +52,9 @@ def of_layout(path: Path, size: tuple[int, int]) -> Mounted | None:
 @functools.lru_cache(4)
 def _names_in(cameras: Path) -> frozenset[str]:
     """Frames that have a camera file in this folder."""
-    files = cameras.glob(f"*{cityscapes.CAMERA.suffix}")
-    return frozenset(file.name.removesuffix(cityscapes.CAMERA.suffix) for file in files)
+    names = (file.name for file in cameras.glob(f"*{cityscapes.CAMERA.suffix}"))
+    own = (name for name in names if not is_litter(name))
+    return frozenset(name.removesuffix(cityscapes.CAMERA.suffix) for name in own)
 
 
 def from_json(path: Path) -> Mounted:
@@ -61,20 +65,59 @@ def from_json(path: Path) -> Mounted:
 
 
 def from_calibration(calibration: Path, path: Path, size: tuple[int, int]) -> Mounted:
-    """Of KITTI: the rectified camera of the image's folder image_02 or image_03; elsewhere 02."""
+    """Of OpenCV, or of KITTI: the rectified camera of the image's folder image_02 or image_03;
+    elsewhere 02."""
+    if calibration.suffix.lower() in OPENCV_SUFFIXES:
+        return _from_opencv(calibration, size)
     if calibration.name != KITTI_FILE:
-        raise ValueError(f"{calibration}: KITTI's intrinsics are in a file called {KITTI_FILE}")
+        raise ValueError(
+            f"{calibration}: neither a calibration of OpenCV ({', '.join(OPENCV_SUFFIXES)}) nor "
+            f"KITTI's, which is called {KITTI_FILE}"
+        )
     found = re.findall(r"image_(\d\d)", str(path))
     number = found[-1] if found else "02"
     camera = kitti.read_camera(calibration.parent, number)
-    if size != camera.size:
-        raise ValueError(
-            f"{calibration}: for images of {camera.size[0]}x{camera.size[1]} pixels, not "
-            f"{size[0]}x{size[1]}; take the calibration of the image's own date"
-        )
+    _check_size(calibration, size, camera.size)
     height_m = kitti.CAMERA_HEIGHT_M
     source = f"{calibration}, camera {number}; height {height_m} m, which is KITTI's"
     return Mounted(camera.K_33, height_m, 0.0, source)
+
+
+def _from_opencv(path: Path, size: tuple[int, int]) -> Mounted:
+    """What OpenCV's calibration writes, or ROS's in the same words: `camera_matrix`, and the
+    images' size where it is there."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        values = _data_of(storage.getNode("camera_matrix"))
+        bent = any(_data_of(storage.getNode("distortion_coefficients")))
+        own = [int(storage.getNode(f"image_{side}").real()) for side in ("height", "width")]
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+    except (cv2.error, SystemError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a calibration file as OpenCV writes it") from error
+    if len(values) != 9:
+        raise ValueError(f"{path}: no camera_matrix with data of 3x3 numbers in it")
+    K_33 = np.array(values).reshape(3, 3)
+    if not np.isfinite(K_33).all() or min(K_33[0, 0], K_33[1, 1]) <= 0:
+        raise ValueError(f"{path}: impossible camera_matrix {values}")
+    if min(own) > 0:
+        _check_size(path, size, (own[0], own[1]))
+    note = "; its lens distortion is not undone: undistort the images first" if bent else ""
+    return Mounted(K_33, None, 0.0, f"{path}{note}")
+
+
+def _data_of(matrix: cv2.FileNode) -> list[float]:
+    data = None if matrix.empty() else matrix.getNode("data")
+    return [] if data is None else [float(data.at(i).real()) for i in range(data.size())]
+
+
+def _check_size(calibration: Path, size: tuple[int, int], own: tuple[int, int]) -> None:
+    if size != own:
+        raise ValueError(
+            f"{calibration}: for images of {own[0]}x{own[1]} pixels, not {size[0]}x{size[1]}; take "
+            f"the image's own calibration"
+        )
 
 
 def matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

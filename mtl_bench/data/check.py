@@ -10,16 +10,16 @@ from mtl_bench.core.dataset import NEIGHBOURS
 from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Task
 from mtl_bench.data import cityscapes_files as files
-from mtl_bench.data import png
+from mtl_bench.data import pictures, png
 from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SEQUENCE, Kind
 
 PUBLISHED_FRAMES = {"train": 2975, "val": 500, "test": 1525}  # of the real Cityscapes
 # What a run needs of every annotated frame: which split, which fields
-NEEDS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "panoptic training": ("train", ("instance_ids",)),
-    "depth training": ("train", (NEIGHBOURS,)),
-    "panoptic evaluation": ("val", ("instance_ids",)),
-    "depth evaluation": ("val", ("depth_m",)),
+NEEDS: dict[str, tuple[str, set[str]]] = {
+    "panoptic training": ("train", {"instance_ids"}),
+    "depth training": ("train", {NEIGHBOURS}),
+    "panoptic evaluation": ("val", {"instance_ids"}),
+    "depth evaluation": ("val", {"depth_m"}),
 }
 _FILES = {"instance_ids": LABELS, "depth_m": DISPARITY, NEIGHBOURS: SEQUENCE}  # fields are from
 _KINDS = (IMAGE, LABELS, SEQUENCE, CAMERA, DISPARITY)
@@ -63,7 +63,8 @@ class Report:
 
     def _lack(self, split: str, fields: Collection[str]) -> str | None:
         """What of these fields a split lacks."""
-        kinds = (IMAGE, CAMERA, *(_FILES[name] for name in sorted(fields)))
+        kinds = (IMAGE, *(_FILES[name] for name in sorted(fields)))
+        kinds += () if fields == {"instance_ids"} else (CAMERA,)  # as `Dataset.needs_camera`
         if not self.frames.get(split):
             return f"no frames in {IMAGE.folder}/{split}"
         for kind in kinds:
@@ -192,7 +193,7 @@ def _check_ego_mask(report: Report, names: list[str]) -> None:
     image_path = files.file_of(report.root / IMAGE.folder / "train", IMAGE, names[0])
     try:
         size = files.read_ego_mask(path).shape
-        image = png.read_header(image_path)
+        image = pictures.read_header(image_path)
         files.check_same_size(path, size, image_path, (image.height, image.width))
     except ValueError as error:
         if not any(str(problem) == str(error) for problem in report.problems):
@@ -209,10 +210,12 @@ def _check_file(path: Path, kind: Kind, deep: bool) -> tuple[int, int] | None:
         files.read_camera(path)
         return None
     assert kind.bits is not None
-    header = png.read_header(path)
+    header = pictures.read_header(path)
     png.check_bits(path, header, kind.bits)
     if deep and kind is LABELS:
         files.read_instance_ids(path)
+    elif deep and kind.bits == 8:
+        pictures.read(path, kind.bits)
     elif deep:
-        png.read(path, kind.bits, color=kind.bits == 8)
+        png.read(path, kind.bits)
     return header.height, header.width

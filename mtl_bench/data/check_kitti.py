@@ -14,16 +14,12 @@ from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Task
 from mtl_bench.data import kitti_files as files
 from mtl_bench.data import kitti_splits as splits
-from mtl_bench.data import png, velodyne
+from mtl_bench.data import pictures, png, velodyne
 from mtl_bench.data.cityscapes_files import check_same_size, read_instance_ids
-from mtl_bench.data.kitti import PSEUDO_LABEL, check_calibrated
+from mtl_bench.data.kitti import PACKAGES, PSEUDO_LABEL, check_calibrated, other_protocol
 from mtl_bench.data.kitti_splits import Frame
 
 _SHOWN = 3  # examples of a problem
-PACKAGES = {
-    "improved": f"an improved depth map; unpack {files.DEPTH_PACKAGE}.zip",
-    "velodyne": "a scan; unpack the drives' velodyne_points",
-}
 _BITS = {"image": 8, "label file": 16, "improved depth map": 16}
 
 
@@ -95,7 +91,9 @@ class KittiReport:
         truths = [metric.truth for metric in task.metrics() if "depth_m" in task.truth]
         lacking = [truth for truth in truths if not self.truth[truth]]
         if lacking:
-            return f"no test frame has {PACKAGES[lacking[0]]}"
+            others = [kind for kind in PACKAGES if self.truth[kind]]
+            hint = f", or {other_protocol(others[0], self.truth[others[0]])}" if others else ""
+            return f"no test frame has {lacking[0]} maps; unpack {PACKAGES[lacking[0]]}{hint}"
         return f"{len(self.problems)} problems" if self.problems else None
 
     def summary(self) -> list[str]:
@@ -220,7 +218,7 @@ def _check_frame(
             if kind == "scan":
                 velodyne.check_length(path, path.stat().st_size)
                 continue
-            header = png.read_header(path)
+            header = pictures.read_header(path)
             png.check_bits(path, header, _BITS[kind])
             size = (header.height, header.width)
             if camera and kind == "image":
@@ -229,8 +227,10 @@ def _check_frame(
                 check_same_size(path, size, image, camera.size)
             if deep and kind == "label file":
                 read_instance_ids(path)
+            elif deep and kind == "image":
+                pictures.read(path, _BITS[kind])
             elif deep:
-                png.read(path, _BITS[kind], color=kind == "image")
+                png.read(path, _BITS[kind])
         except ValueError as error:
             report.problems.append(Problem(kind, str(error)))
 

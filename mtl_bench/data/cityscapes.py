@@ -22,6 +22,7 @@ from mtl_bench.data.cityscapes_files import CAMERA, DISPARITY, IMAGE, LABELS, SE
 from mtl_bench.data.cityscapes_files import Kind as Package
 from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.labels import CITYSCAPES20
+from mtl_bench.data.motion import moving
 from mtl_bench.data.pseudo_frames import CityscapesFrames
 
 
@@ -73,6 +74,9 @@ class Cityscapes(Dataset):
         self._ego_mask = files.read_ego_mask(mask_path) if masked and mask_path.exists() else None
         self._camera_names = self._find_cameras()
         self._require_files()
+        self._standing = 0  # frames that are left out
+        if self._compares and data.min_flow > 0:
+            self._leave_out_standing()
 
     @classmethod
     def recognises(cls, root: Path) -> bool:
@@ -114,11 +118,17 @@ class Cityscapes(Dataset):
         """Only labels know where the sky is."""
         return self.static_from == "labels"
 
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a row says of the training frames, where some are left out."""
+        left_out = {"standing": self._standing}
+        return {"frames": len(self), "left_out": left_out} if self._standing else {}
+
     def sources(self) -> list[Source]:
         """The files that samples are made of and that `on_disk` can hold."""
         images = [self._image_file(name) for name in self.names]
         if self._compares:
-            around = {files.neighbour(name, step) for name in self.names for step in (-1, 1)}
+            around = {beside for name in self.names for beside in self._around(name)}
             images += sorted({self._file(SEQUENCE, name) for name in around}.difference(images))
         labels = [self._label_files[name] for name in self.names if name in self._label_files]
         sources = [(path, frame_cache.IMAGE) for path in images]
@@ -132,10 +142,14 @@ class Cityscapes(Dataset):
         own_size = images[0].own_size
         frame = (path, own_size)
         if self._compares:
-            around = [self._file(SEQUENCE, files.neighbour(name, step)) for step in (-1, 1)]
+            around = [self._file(SEQUENCE, beside) for beside in self._around(name)]
             images += [self.on_disk.read(beside, frame_cache.IMAGE, frame) for beside in around]
-        camera = files.read_camera(self._file(CAMERA, self._camera_names[name]))
-        K = torch.tensor([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
+        camera = K_33 = None
+        camera_path = self._file(CAMERA, self._camera_names[name])
+        if self.needs_camera or camera_path.exists():
+            camera = files.read_camera(camera_path)
+            K = torch.tensor([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
+            K_33 = scale(K, self.data.width / own_size[1], self.data.height / own_size[0])
 
         fields: dict[str, torch.Tensor] = {}
         wanted = "instance_ids" in self.needs
@@ -155,6 +169,7 @@ class Cityscapes(Dataset):
         if ids_HW is not None and (wanted or not self.training):
             fields["instance_ids"] = ids_HW
         if "depth_m" in self.needs:
+            assert camera is not None
             depth_path = self._file(DISPARITY, name)
             depth_m = files.read_depth_m(depth_path, camera)
             files.check_same_size(depth_path, depth_m.shape, *frame)
@@ -164,9 +179,9 @@ class Cityscapes(Dataset):
 
         return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
-            K_33=scale(K, self.data.width / own_size[1], self.data.height / own_size[0]),
-            camera_height_m=camera.height_m,
-            camera_pitch_rad=camera.pitch_rad,
+            K_33=K_33,
+            camera_height_m=camera.height_m if camera else 0.0,
+            camera_pitch_rad=camera.pitch_rad if camera else 0.0,
             fields=fields,
             static=ids_HW if self.training else None,
         )
@@ -194,6 +209,19 @@ class Cityscapes(Dataset):
     def _image_file(self, name: str) -> Path:
         return self._file(IMAGE if name in self._annotated else SEQUENCE, name)
 
+    def _around(self, name: str) -> list[str]:
+        """The frame before and the one after."""
+        return [files.neighbour(name, step) for step in (-self.data.stride, self.data.stride)]
+
+    def _leave_out_standing(self) -> None:
+        pairs = {}
+        for name in self.names:
+            image = self._image_file(name)
+            before, after = (self._file(SEQUENCE, beside) for beside in self._around(name))
+            pairs[name] = ((before, image), (image, after))
+        kept = moving(pairs, self.data, lambda p: self.on_disk.read(p, frame_cache.IMAGE).pixels)
+        self._standing, self.names = len(pairs) - len(kept), kept
+
     def _find_labels(self) -> dict[str, Path]:
         folders = [self._folder(LABELS)]
         if self.further_labels:
@@ -207,7 +235,9 @@ class Cityscapes(Dataset):
     def _with_sequence_frames(self) -> list[str]:
         """Annotated frames, and labelled frames of the sequences that have both neighbours."""
         present = files.names_in(self._folder(SEQUENCE), SEQUENCE)
-        further = files.with_neighbours(self._label_files.keys() & present, present)
+        further = files.with_neighbours(
+            self._label_files.keys() & present, present, self.data.stride
+        )
         return sorted(further | self._annotated)
 
     def _find_cameras(self) -> dict[str, str]:
@@ -222,11 +252,11 @@ class Cityscapes(Dataset):
         return cameras
 
     def _require_files(self) -> None:
-        needed = [(CAMERA, set(self._camera_names.values()))]
+        needed = [(CAMERA, set(self._camera_names.values()))] if self.needs_camera else []
         if "instance_ids" in self.needs:
             needed.append((LABELS, set(self.names)))
         if self._compares:
-            around = {files.neighbour(name, step) for name in self.names for step in (-1, 1)}
+            around = {beside for name in self.names for beside in self._around(name)}
             needed.append((SEQUENCE, around))
         if "depth_m" in self.needs:
             needed.append((DISPARITY, set(self.names)))
@@ -235,8 +265,10 @@ class Cityscapes(Dataset):
             found = self._label_files if labels else files.names_in(self._folder(kind), kind)
             missing = sorted(names.difference(found))
             if missing:
+                far = kind is SEQUENCE and self.data.stride > 1
+                stride = f" at recipe.data.stride = {self.data.stride}" if far else ""
                 raise ValueError(
                     f"{self._file(kind, missing[0])}: missing, one of {len(missing)} "
-                    f"{kind.what}s that {self.split} lacks; unpack {kind.package}, or see all "
-                    f"with 'mtl-bench data check {self.root}'"
+                    f"{kind.what}s that {self.split} lacks{stride}; unpack {kind.package}, or see "
+                    f"all with 'mtl-bench data check {self.root}'"
                 )

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.files import is_litter
 from mtl_bench.core.labels import DIVISOR, LARGEST_ID
-from mtl_bench.data import png
+from mtl_bench.data import pictures, png
 from mtl_bench.data.labels import KNOWN_LABEL_IDS
 
 
@@ -30,14 +31,16 @@ class Kind:
     suffix: str
     what: str  # in a sentence: "3 frames lack their ..."
     bits: int | None = None  # of a PNG
+    also: str | None = None  # another suffix that files may have
 
     @property
     def package(self) -> str:
         return f"{self.folder}_trainvaltest.zip"
 
 
-IMAGE = Kind("leftImg8bit", "_leftImg8bit.png", "image", 8)
-SEQUENCE = Kind("leftImg8bit_sequence", "_leftImg8bit.png", "neighbour frame", 8)
+_PNG, _JPEG = "_leftImg8bit.png", "_leftImg8bit.jpg"  # as distributed; as converted
+IMAGE = Kind("leftImg8bit", _PNG, "image", 8, _JPEG)
+SEQUENCE = Kind("leftImg8bit_sequence", _PNG, "neighbour frame", 8, _JPEG)
 LABELS = Kind("gtFine", "_gtFine_instanceIds.png", "label file", 16)
 DISPARITY = Kind("disparity", "_disparity.png", "disparity map", 16)
 CAMERA = Kind("camera", "_camera.json", "camera file")
@@ -71,7 +74,11 @@ def neighbour(name: str, step: int) -> str:
 
 def file_of(folder: Path, kind: Kind, name: str) -> Path:
     """A frame's file of a kind; the folder is `<root>/<kind.folder>/<split>`."""
-    return folder / name.rsplit("_", 2)[0] / f"{name}{kind.suffix}"
+    path = folder / name.rsplit("_", 2)[0] / f"{name}{kind.suffix}"
+    if kind.also and not path.exists():
+        other = path.with_name(f"{name}{kind.also}")
+        return other if other.exists() else path
+    return path
 
 
 def names_in(folder: Path, kind: Kind) -> set[str]:
@@ -79,11 +86,13 @@ def names_in(folder: Path, kind: Kind) -> set[str]:
     if not folder.is_dir():
         return set()
     try:
-        cities = [city for city in os.scandir(folder) if city.is_dir()]
+        cities = [c for c in os.scandir(folder) if c.is_dir() and not is_litter(c.name)]
         files = [file.name for city in cities for file in os.scandir(city)]
     except OSError as error:
         raise ValueError(f"{error.filename}: cannot be listed ({error.strerror})") from error
-    return {name.removesuffix(kind.suffix) for name in files if name.endswith(kind.suffix)}
+    names = [name for name in files if not is_litter(name)]
+    endings = (kind.suffix, kind.also or kind.suffix)
+    return {name.removesuffix(end) for end in endings for name in names if name.endswith(end)}
 
 
 def annotated_names(root: Path, split: str) -> list[str]:
@@ -106,12 +115,14 @@ def annotated_names(root: Path, split: str) -> list[str]:
     return names
 
 
-def with_neighbours(names: set[str], present: set[str]) -> set[str]:
-    """Those of the names whose previous and next frames are present, too."""
-    return {name for name in names if {neighbour(name, -1), neighbour(name, 1)} <= present}
+def with_neighbours(names: set[str], present: set[str], stride: int = 1) -> set[str]:
+    """Those of the names whose neighbours, so many frames away, are present, too."""
+    return {
+        name for name in names if {neighbour(name, -stride), neighbour(name, stride)} <= present
+    }
 
 
-def unlabelled_names(root: Path, split: str) -> list[str]:
+def unlabelled_names(root: Path, split: str, stride: int = 1) -> list[str]:
     """Frames that pseudo labels can be made for, sorted.
 
     They have no label file, but a camera (their own or their annotated frame's) and both neighbours
@@ -121,7 +132,7 @@ def unlabelled_names(root: Path, split: str) -> list[str]:
     labelled = names_in(root / LABELS.folder / split, LABELS)
     sequences = {split_name(name)[:2] for name in annotated_names(root, split)}
     own = {name for name in present - labelled if split_name(name)[:2] in sequences}
-    return sorted(with_neighbours(own, present))
+    return sorted(with_neighbours(own, present, stride))
 
 
 def camera_names(annotated: Set[str], names: Set[str]) -> dict[str, str]:
@@ -191,7 +202,7 @@ def read_camera(path: Path) -> Camera:
 
 def read_image(path: Path) -> NDArray[np.uint8]:
     """[H,W,3] RGB."""
-    return png.read(path, 8, color=True)
+    return pictures.read(path, bits=8)
 
 
 def read_instance_ids(path: Path) -> NDArray[np.uint16]:

@@ -31,6 +31,7 @@ from mtl_bench.data.cityscapes_files import (
 from mtl_bench.data.frame_cache import FrameCache, Source
 from mtl_bench.data.kitti_splits import Frame
 from mtl_bench.data.labels import CITYSCAPES19
+from mtl_bench.data.motion import moving
 from mtl_bench.data.png import to_size
 from mtl_bench.data.pseudo_frames import KittiFrames
 
@@ -40,6 +41,11 @@ TRUTHS = {
     "improved": ("improved",),
     "velodyne": ("velodyne",),
 }
+PACKAGES = {
+    "improved": f"{files.DEPTH_PACKAGE}.zip into it or beside it",
+    "velodyne": "the drives' velodyne_points",
+}
+PROTOCOLS = {"improved": "eigen-improved", "velodyne": "eigen-raw"}  # that measure on them
 PSEUDO_LABEL = "mtl-bench pseudo-label --checkpoint CITYSCAPES_RUN --data"
 
 
@@ -90,6 +96,8 @@ class Kitti(Dataset):
         self.tree = files.Tree(root)
         self.left_out: Counter[str] = Counter()
         frames = self._present()
+        if self._compares and data.min_flow > 0:
+            frames = self._moving(frames)
         if "depth_m" in self.needs:
             frames = self._with_truth(frames, truth)
         self._frames = {frame.name: frame for frame in frames}
@@ -102,6 +110,7 @@ class Kitti(Dataset):
         self._cameras = {
             (date, camera): files.read_camera(root / date, camera)
             for date, camera in {(frame.date, frame.camera) for frame in frames}
+            if self.needs_camera or files.is_calibrated(root / date)
         }
 
     @classmethod
@@ -160,7 +169,7 @@ class Kitti(Dataset):
         """The files that samples are made of and that `on_disk` can hold."""
         frames = set(self._frames.values())
         if self._compares:
-            frames |= {frame.later(step) for frame in frames for step in (-1, 1)}
+            frames |= {beside for frame in frames for beside in self._around(frame)}
         sources = [(self.tree.image(frame), frame_cache.IMAGE) for frame in sorted(frames)]
         labels = [
             (path, frame_cache.LABELS) for path in self._label_files.values() if self.training
@@ -182,11 +191,28 @@ class Kitti(Dataset):
             self._leave_out("absent", len(wanted) - len(present))
         frames = present
         if self.split == "train":
-            frames = [frame for frame in present if self.tree.has_neighbours(frame)]
+            frames = [
+                frame for frame in present if self.tree.has_neighbours(frame, self.data.stride)
+            ]
             self._leave_out("without neighbours", len(present) - len(frames))
         if not frames:
             raise ValueError(self._nothing(choice))
         return frames
+
+    def _around(self, frame: Frame) -> list[Frame]:
+        """The frame before and the one after."""
+        return [frame.later(step) for step in (-self.data.stride, self.data.stride)]
+
+    def _moving(self, frames: list[Frame]) -> list[Frame]:
+        pairs = {}
+        for frame in frames:
+            before, image, after = map(self.tree.image, sorted([frame, *self._around(frame)]))
+            pairs[frame.name] = ((before, image), (image, after))
+        kept = set(
+            moving(pairs, self.data, lambda p: self.on_disk.read(p, frame_cache.IMAGE).pixels)
+        )
+        self._leave_out("standing", len(frames) - len(kept))
+        return [frame for frame in frames if frame.name in kept]
 
     def _of_no_list(self, *others: str) -> list[Frame]:
         kept = {frame for split in others for frame in splits.frames_of(self.root, split)}
@@ -198,6 +224,8 @@ class Kitti(Dataset):
 
     def _nothing(self, choice: str) -> str:
         see = f"see 'mtl-bench data check {self.root}'"
+        if self.left_out["without neighbours"] and self.data.stride > 1:
+            see = f"lower recipe.data.stride = {self.data.stride}, or {see}"
         if self.split == "train" and choice == "all":
             return f"{self.root}: no frame to train on that has both neighbours; {see}"
         advice = f"unpack the drives that have them, {see}"
@@ -219,11 +247,13 @@ class Kitti(Dataset):
         self.truth_counts = Counter(self._truth.values())
         self._leave_out("without depth maps", len(frames) - len(self._truth))
         if not self._truth:
-            wanted = " or ".join(TRUTHS[truth])
+            wanted = TRUTHS[truth]
+            others = {kind: sum(map(has[kind], frames)) for kind in has if kind not in wanted}
+            hints = [f"unpack {PACKAGES[kind]}" for kind in wanted]
+            hints += [other_protocol(kind, count) for kind, count in others.items() if count]
             raise ValueError(
                 f"{self.root}: none of its {len(frames)} frames of {self.split} has a depth map "
-                f"({wanted}); unpack {files.DEPTH_PACKAGE}.zip into it, or the drives' "
-                f"velodyne_points"
+                f"({' or '.join(wanted)}); {', or '.join(hints)}"
             )
         return list(self._truth)
 
@@ -241,12 +271,16 @@ class Kitti(Dataset):
     def read(self, name: str) -> DecodedFrame:
         frame = self._frames[name]
         path = self.tree.image(frame)
-        camera = self._cameras[frame.date, frame.camera]
+        camera = self._cameras.get((frame.date, frame.camera))
         images = [self.on_disk.read(path, frame_cache.IMAGE)]
-        check_calibrated(path, images[0].own_size, camera)
-        size = camera.size
+        size = (images[0].own_size[0], images[0].own_size[1])
+        K_33 = None
+        if camera is not None:
+            check_calibrated(path, size, camera)
+            K = torch.from_numpy(camera.K_33).float()
+            K_33 = scale(K, self.data.width / size[1], self.data.height / size[0])
         if self._compares:
-            around = [self.tree.image(frame.later(step)) for step in (-1, 1)]
+            around = [self.tree.image(beside) for beside in self._around(frame)]
             whole = (path, size)
             images += [self.on_disk.read(beside, frame_cache.IMAGE, whole) for beside in around]
         fields: dict[str, torch.Tensor] = {}
@@ -255,14 +289,14 @@ class Kitti(Dataset):
         if ids_HW is not None and ("instance_ids" in self.needs or not self.training):
             fields["instance_ids"] = ids_HW
         if "depth_m" in self.needs:
+            assert camera is not None
             depth_m = self._read_depth_m(frame, path, camera)
             if self.training:
                 depth_m = self._to_input(depth_m, path, cv2.INTER_NEAREST_EXACT)
             fields["depth_m"] = torch.from_numpy(depth_m)
-        K_33 = torch.from_numpy(camera.K_33).float()
         return DecodedFrame(
             images_N3HW=[torch.from_numpy(image.pixels).permute(2, 0, 1) for image in images],
-            K_33=scale(K_33, self.data.width / size[1], self.data.height / size[0]),
+            K_33=K_33,
             camera_height_m=files.CAMERA_HEIGHT_M,
             fields=fields,
             static=ids_HW if self.training else None,
@@ -298,6 +332,14 @@ class Kitti(Dataset):
 
     def _to_input(self, array: NDArray[Any], path: Path, interpolation: int) -> NDArray[Any]:
         return to_size(array, self.data.height, self.data.width, interpolation)
+
+
+def other_protocol(truth: str, count: int) -> str:
+    """What to set where these depth maps are there, and those that were asked for are not."""
+    return (
+        f"measure on the {truth} maps that {count} frames have: "
+        f"--set recipe.evaluate.protocol={PROTOCOLS[truth]} --set recipe.evaluate.also=[]"
+    )
 
 
 def check_calibrated(path: Path, size: tuple[int, ...], camera: files.Camera) -> None:

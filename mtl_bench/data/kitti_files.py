@@ -1,19 +1,20 @@
 """KITTI raw on disk: where each file lies and what it says, in NumPy.
 
     <date>/calib_cam_to_cam.txt, calib_velo_to_cam.txt
-    <date>/<drive>/image_02|03/data/<10 digits>.png             8-bit RGB; 02 left, 03 right
+    <date>/<drive>/image_02|03/data/<10 digits>.png|.jpg        8-bit RGB; 02 left, 03 right
     <date>/<drive>/velodyne_points/data/<10 digits>.bin
     <date>/<drive>/label_02|03/data/<10 digits>.png             16-bit instance ids, ours
 
 The improved depth maps (Uhrig et al., 3DV 2017), `<drive>/proj_depth/groundtruth/image_02/*.png`,
-lie under `<date>/`, or as their own package has them: under `train/` and `val/`, in the root or
-beside it, in a folder `data_depth_annotated` or not. Every error is a ValueError of one line.
+lie under `<date>/`, or as their own package has them: in the root or beside it, in a folder
+`data_depth_annotated` or not, under `train/` and `val/` or not. Every error is a ValueError of one
+line.
 """
 
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from mtl_bench.data.kitti_splits import CAMERAS, Frame
 CAMERA_HEIGHT_M = 1.65  # of every drive, above the ground (Geiger et al., IJRR 2013)
 RECORD = "pseudo_labels.json"  # in the root where the labels are a network's
 DEPTH_PACKAGE = "data_depth_annotated"
+IMAGES = (".jpeg", ".jpg", ".png")  # the lossless one last: it counts where there are several
 _DATE = re.compile(r"\d{4}_\d\d_\d\d")
 _CALIBRATION, _SCANNER = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
 
@@ -55,10 +57,10 @@ class Tree:
                 f"{root}: no day such as 2011_09_26 in it; expected KITTI raw's layout, "
                 f"<date>/<drive>/image_02/data/"
             )
-        self._numbers: dict[tuple[str, str, str], frozenset[int]] = {}
+        self._endings: dict[tuple[str, str, str], dict[int, str]] = {}  # of files, by number
         self._improved: dict[tuple[str, str], Path] = {}
         packages = [base / name for base in (root, root.parent) for name in ("", DEPTH_PACKAGE)]
-        self._depth_roots = [base / half for base in packages for half in ("train", "val")]
+        self._depth_roots = [base / half for base in packages for half in ("train", "val", "")]
 
     # --- places -----------------------------------------------------------------------------------
 
@@ -66,8 +68,15 @@ class Tree:
         drive = self.root / frame.date / frame.drive
         return drive / folder / "data" / f"{frame.number:010d}{suffix}"
 
-    def image(self, frame: Frame) -> Path:
+    def _original(self, frame: Frame) -> Path:
         return self._in_drive(frame, f"image_{frame.camera}")
+
+    def image(self, frame: Frame) -> Path:
+        """As it was distributed, or as it was converted to save disk space."""
+        path = self._original(frame)
+        return path.with_suffix(
+            self._files(frame, self._original, IMAGES).get(frame.number, ".png")
+        )
 
     def labels(self, frame: Frame) -> Path:
         path = self._in_drive(frame, f"label_{frame.camera}")
@@ -87,27 +96,29 @@ class Tree:
 
     # --- what is there ----------------------------------------------------------------------------
 
-    def _has(self, frame: Frame, path_of: Callable[[Frame], Path]) -> bool:
+    def _files(
+        self, frame: Frame, path_of: Callable[[Frame], Path], endings: Sequence[str] = (".png",)
+    ) -> dict[int, str]:
+        """Of the folder that holds a frame's file."""
         key = path_of.__name__, frame.drive, frame.camera
-        if key not in self._numbers:
-            path = path_of(frame)
-            self._numbers[key] = _numbers_in(path.parent, path.suffix)
-        return frame.number in self._numbers[key]
+        if key not in self._endings:
+            self._endings[key] = _files_in(path_of(frame).parent, endings)
+        return self._endings[key]
 
     def has_image(self, frame: Frame) -> bool:
-        return self._has(frame, self.image)
+        return frame.number in self._files(frame, self._original, IMAGES)
 
     def has_labels(self, frame: Frame) -> bool:
-        return self._has(frame, self.labels)
+        return frame.number in self._files(frame, self.labels)
 
     def has_scan(self, frame: Frame) -> bool:
-        return self._has(frame, self.scan)
+        return frame.number in self._files(frame, self.scan, (".bin",))
 
     def has_improved(self, frame: Frame) -> bool:
-        return self._has(frame, self.improved)
+        return frame.number in self._files(frame, self.improved)
 
-    def has_neighbours(self, frame: Frame) -> bool:
-        return all(self.has_image(frame.later(step)) for step in (-1, 1))
+    def has_neighbours(self, frame: Frame, stride: int = 1) -> bool:
+        return all(self.has_image(frame.later(step)) for step in (-stride, stride))
 
     @property
     def predicted_labels(self) -> bool:
@@ -123,21 +134,26 @@ class Tree:
         """Every frame that has an image, in order."""
         for drive in self.drives():
             for camera in CAMERAS.values():
-                path = self.image(Frame(drive, camera, 0))
-                for number in sorted(_numbers_in(path.parent, path.suffix)):
-                    yield Frame(drive, camera, number)
+                first = Frame(drive, camera, 0)
+                for number in sorted(self._files(first, self._original, IMAGES)):
+                    yield first.later(number)
 
 
-def _numbers_in(folder: Path, suffix: str) -> frozenset[int]:
+def _files_in(folder: Path, endings: Sequence[str]) -> dict[int, str]:
+    """Endings by number; of a frame that has several files, the last ending's."""
     if not folder.is_dir():
-        return frozenset()
+        return {}
     try:
         with os.scandir(folder) as entries:  # 95k names in all: Path objects would take seconds
-            names = [entry.name for entry in entries if entry.name.endswith(suffix)]
+            names = [entry.name for entry in entries]
     except OSError as error:
         raise ValueError(f"{folder}: cannot be listed ({error.strerror})") from error
-    stems = [name.removesuffix(suffix) for name in names]
-    return frozenset(int(stem) for stem in stems if len(stem) == 10 and stem.isdigit())
+    return {
+        int(name[:10]): ending
+        for ending in endings
+        for name in names
+        if name.endswith(ending) and len(name) == 10 + len(ending) and name[:10].isdecimal()
+    }
 
 
 # --- calibration ----------------------------------------------------------------------------------
@@ -154,6 +170,10 @@ class Camera:
     @property
     def K_33(self) -> NDArray[np.float64]:
         return self.P_34[:, :3]
+
+
+def is_calibrated(date_folder: Path) -> bool:
+    return (date_folder / _CALIBRATION).exists()
 
 
 def read_camera(date_folder: Path, camera: str) -> Camera:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.PngImagePlugin import PngImageFile
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES = 33  # signature and IHDR
 _END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk, the same in every file
 
@@ -22,31 +22,51 @@ class Header:
     bits: int  # per channel
 
 
-def read(path: Path, bits: int, color: bool = False) -> NDArray[Any]:
-    """Decode a file into [H,W] or, in color, [H,W,3] RGB; uint8 or uint16 as `bits` says.
+def read(path: Path, bits: int) -> NDArray[Any]:
+    """Decode a file of one channel into [H,W]; uint8 or uint16 as `bits` says.
 
     Raises:
         ValueError: the file is missing, truncated, damaged or of another bit depth.
     """
+    data = read_bytes(path)
+    check(path, data, bits)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError(f"{path}: damaged PNG; copy or unpack the file again")
+    if image.ndim != 2:
+        raise ValueError(f"{path}: {image.shape[2]} channels where one is expected")
+    return np.asarray(image)
+
+
+def encode(pixels: NDArray[Any], *options: int) -> bytes:
+    """A file's content: [H,W] or RGB [H,W,3], uint8 or uint16.
+
+    Args:
+        options: OpenCV's, in pairs.
+    """
+    pixels = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    return cv2.imencode(".png", pixels, options)[1].tobytes()
+
+
+def read_bytes(path: Path) -> bytes:
+    """Raises: ValueError where the file cannot be read."""
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-    check_bits(path, _parse(path, data, data), bits)
+
+
+def check(path: Path, data: bytes, bits: int | None) -> None:
+    """Raises: ValueError where a file's bytes are no whole, sound PNG of this depth (None: any)."""
+    header = _parse(path, data, data)
+    if bits is not None:
+        check_bits(path, header, bits)
     try:
         PngImageFile(io.BytesIO(data)).verify()
     except Exception as error:  # Pillow's have no class in common
         raise ValueError(
             f"{path}: damaged PNG (checksum); copy or unpack the file again"
         ) from error
-    flag = cv2.IMREAD_COLOR if color else cv2.IMREAD_UNCHANGED
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
-    if image is None:
-        raise ValueError(f"{path}: damaged PNG; copy or unpack the file again")
-    if image.ndim != 2 + color:
-        raise ValueError(f"{path}: {image.shape[2]} channels where one is expected")
-    found: NDArray[Any] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if color else image
-    return found
 
 
 def read_header(path: Path) -> Header:
@@ -72,7 +92,7 @@ def check_bits(path: Path, header: Header, bits: int) -> None:
 
 def _parse(path: Path, start: bytes, end: bytes) -> Header:
     """The header, by a file's first bytes, once its last ones show that it is whole."""
-    if not start.startswith(_SIGNATURE):
+    if not start.startswith(SIGNATURE):
         raise ValueError(f"{path}: not a PNG file" if start else f"{path}: the file is empty")
     if end.rfind(_END) < 0:  # Pillow does not look at what follows the name of the last chunk
         raise ValueError(f"{path}: truncated PNG; copy or unpack the file again")

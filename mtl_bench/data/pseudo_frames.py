@@ -11,21 +11,20 @@ KITTI: the split's frames, beside their images. No class there is the ego vehicl
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mtl_bench.core.dataset import LabelGroup
-from mtl_bench.core.files import write_bytes
+from mtl_bench.core.files import is_litter, write_bytes
 from mtl_bench.core.labels import DIVISOR
 from mtl_bench.core.recipe import Recipe
 from mtl_bench.data import cityscapes_files as files
-from mtl_bench.data import kitti_files, kitti_splits, png
+from mtl_bench.data import kitti_files, kitti_splits, pictures, png
 from mtl_bench.data.cityscapes_files import LABELS, SEQUENCE, Kind
 
 LABEL_IDS = Kind("gtFine", "_gtFine_labelIds.png", "label map", 8)
@@ -40,7 +39,7 @@ class CityscapesFrames:
         self.source, self.out = root / SEQUENCE.folder / split, out
         self.folder = out / LABELS.folder / split
         self.size = (recipe.data.height, recipe.data.width)
-        self.names = files.unlabelled_names(root, split)
+        self.names = files.unlabelled_names(root, split, recipe.data.stride)
         if not self.names:
             raise ValueError(
                 f"{self.source}: no frame without a human label that has both neighbours; unpack "
@@ -60,7 +59,7 @@ class CityscapesFrames:
         return files.names_in(self.folder, LABELS).intersection(self.names)
 
     def stranger(self) -> Path | None:
-        return next(self.out.rglob("*_gtFine_*"), None)
+        return _first(self.out.rglob("*_gtFine_*"))
 
     def record(self) -> dict[str, Any]:
         first = self.image(min(files.names_in(self.source, SEQUENCE)))
@@ -98,7 +97,7 @@ class KittiFrames:
     def groups(self) -> Iterator[LabelGroup]:
         for _, names in groupby(self.names, lambda name: name[:10]):
             day = list(names)
-            header = png.read_header(self.image(day[0]))
+            header = pictures.read_header(self.image(day[0]))
             yield LabelGroup(day, (self._divisible(header.height), self._divisible(header.width)))
 
     def _divisible(self, length: int) -> int:
@@ -111,7 +110,7 @@ class KittiFrames:
         return {name for name, frame in self._frames.items() if self._labels.has_labels(frame)}
 
     def stranger(self) -> Path | None:
-        return next(self.out.glob("*/*/label_0[23]/data/*.png"), None)
+        return _first(self.out.glob("*/*/label_0[23]/data/*.png"))
 
     def record(self) -> dict[str, Any]:
         return {"input": "the frames' own size"}  # of any split: frames' names tell them apart
@@ -121,6 +120,10 @@ class KittiFrames:
         _write(self._labels.labels(self._frames[name]), ids_HW)
 
 
+def _first(paths: Iterable[Path]) -> Path | None:
+    return next((path for path in paths if not is_litter(path.name)), None)
+
+
 def _write(path: Path, array_HW: NDArray[Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, cv2.imencode(".png", array_HW)[1].tobytes())
+    write_bytes(path, png.encode(array_HW))

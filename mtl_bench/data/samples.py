@@ -127,8 +127,9 @@ class Samples:
         return sample
 
 
-def _camera(frame: DecodedFrame, K_33: Tensor | None) -> Camera | None:
+def _camera(frame: DecodedFrame, K_33: Tensor | None) -> Camera:
+    """NaN intrinsics where the frame has none: nobody takes them for a camera's."""
     if K_33 is None:
-        return None
+        K_33 = torch.full((3, 3), torch.nan)
     height, pitch = frame.camera_height_m, frame.camera_pitch_rad
     return Camera(K_33, torch.tensor(height), torch.tensor(pitch))

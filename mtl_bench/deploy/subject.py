@@ -80,7 +80,7 @@ def subject(
         ValueError: a size that the network's deepest stride does not divide.
     """
     check_size(cell, size)
-    split = cell.recipe.evaluate.split
+    split = cell.recipe.evaluate.images
     looks = open_samples(cell.recipe, (), split, data, training=False)  # at images, not at labels
     samples = [looks.sample(n, None) for n in range(min(images, len(looks)))]
     camera = collate(samples[:1]).camera

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from mtl_bench.core import config
 from mtl_bench.core.batch import Batch, collate
+from mtl_bench.core.recipe import NOTHING
 from mtl_bench.core.task import Metric, Results, Size, Task, finish
 from mtl_bench.data.loader import eval_batches
 from mtl_bench.data.samples import Samples, open_samples
@@ -98,13 +99,15 @@ def rehearse(model: Model, cell: config.Cell, root: Path, device: torch.device) 
 def open_walks(
     recipe: config.Recipe, tasks: Sequence[Task], root: Path, split: str | None = None
 ) -> list[Walk]:
-    """The walks that an evaluation takes, the main one first; decodes nothing.
+    """The walks that an evaluation takes, the main one first, or none; decodes nothing.
 
     Raises:
         ValueError: a protocol that the data set cannot serve, or a split that lacks its files.
     """
-    metrics = [(task, metric) for task in tasks for metric in task.metrics(split)]
     main = split or recipe.evaluate.split
+    if main == NOTHING:
+        return []
+    metrics = [(task, metric) for task in tasks for metric in task.metrics(split)]
     mains = [metric for _, metric in metrics if not metric.prefix]
     truth = next((metric.truth for metric in mains if metric.truth != "default"), "default")
     groups: dict[tuple[str, str], list[tuple[Task, Metric]]] = {(main, truth): []}
@@ -173,6 +176,8 @@ def measure(
     Args:
         results: a batch's results of some tasks, by task, at the size of its truth.
     """
+    if not walks:
+        return Evaluation({}, {"dataset": cell.recipe.data.dataset, "split": NOTHING})
     done, total = 0, sum(len(walk.samples) for walk in walks)
     gallery = Gallery(len(walks[0].samples))
     input_size: Size = (0, 0)

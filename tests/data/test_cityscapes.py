@@ -598,7 +598,8 @@ def test_check_lists_everything_at_once(tree):
     assert "  and 2 more" in lines
     assert "train: 1 missing camera file" in lines
     assert "train: 1 bad label file" in lines
-    assert report.obstacle("panoptic training") == "2 problems"
+    assert report.obstacle("panoptic training") == "1 problem"
+    assert report.obstacle("depth training") == "1 problem"
     assert report.obstacle("depth training") == "1 problem"
     assert report.obstacle("panoptic evaluation") is None
     absent = "no disparity/val; unpack disparity_trainvaltest.zip"

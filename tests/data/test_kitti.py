@@ -253,8 +253,10 @@ def test_improved_maps_in_every_layout(tree):
         (package, tree / "data_depth_annotated"),
         (tree / "data_depth_annotated" / "val", tree / "train"),
         (tree / "train", tree.parent / "val"),
-        (tree.parent / "val" / TEST / "proj_depth", inside),
+        (tree.parent / "val" / TEST, tree.parent / "data_depth_annotated" / TEST),
+        (tree.parent / "data_depth_annotated" / TEST / "proj_depth", inside),
     ):
+        target.parent.mkdir(exist_ok=True)
         source.rename(target)
         dataset = open_tree(tree, "test", truth="improved")
         assert torch.equal(dataset.sample(0, None).fields["depth_m"], expected)
@@ -533,8 +535,9 @@ def test_check_of_a_tree(tree):
     lines = call("data", "check", tree).splitlines()
     assert lines[-2].startswith("recipe kitti, panoptic: 3 training frames have no labels; make")
     assert lines[-1] == (
-        "recipe kitti, depth: no test frame has an improved depth map; unpack "
-        "data_depth_annotated.zip"
+        "recipe kitti, depth: no test frame has improved maps; unpack data_depth_annotated.zip "
+        "into it or beside it, or measure on the velodyne maps that 5 frames have: "
+        "--set recipe.evaluate.protocol=eigen-raw --set recipe.evaluate.also=[]"
     )
     for path in (tree / "2011_09_26" / VAL / "velodyne_points" / "data").iterdir():
         path.write_bytes(b"x")

@@ -24,9 +24,10 @@ from mtl_bench.core.geometry import scale_intrinsics
 from mtl_bench.core.labels import IGNORE
 from mtl_bench.core.task import tasks_of, tasks_of_cell
 from mtl_bench.core.view import METRES
+from mtl_bench.data import video
 from mtl_bench.data.labels import CITYSCAPES19, CITYSCAPES20
 from mtl_bench.model import Outputs, build_model
-from mtl_bench.show.predict import Predictor, video
+from mtl_bench.show.predict import Predictor
 from mtl_bench.show.predict import job as predictions
 from mtl_bench.show.predict.cameras import Given, camera_of
 from mtl_bench.tasks.depth.picture import HEIGHTS, UNSCALED, DepthView
@@ -240,7 +241,7 @@ def test_a_guess_is_called_one(tree):
         ({"focal_and_center": (9, 8, 7, 6), "camera": Path("x")}, "exclude each other"),
         ({"camera": Path("nowhere.json")}, r"nowhere\.json: cannot be read"),
         ({"calibration": Path("no/calib_cam_to_cam.txt")}, r"no/calib_cam_to_cam\.txt: missing"),
-        ({"calibration": Path("other.txt")}, "are in a file called calib_cam_to_cam"),
+        ({"calibration": Path("other.txt")}, "neither a calibration of OpenCV .* nor KITTI's"),
     ],
 )
 def test_impossible_cameras(tree, given, message):
@@ -451,8 +452,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tree, tmp_path):
     for words, message in (
         ([text], "neither an image nor a video"),
         ([empty], "neither an image nor a video"),
-        ([damaged], "not an image that OpenCV can read, or a damaged one"),
-        ([tree.plain, text], "not an image that OpenCV can read"),
+        ([damaged], "half.png: truncated PNG"),
+        ([text, damaged], "notes.txt: not an image that OpenCV can read, or a damaged one (2 im"),
         ([tree.root / "gone.png"], "no file, folder or pattern"),
         ([tree.plain, "--camera-height", "1.4"], "takes the camera's intrinsics, too"),
         ([tree.plain, "--fx", "9"], "give all of --fx --fy --cx --cy"),

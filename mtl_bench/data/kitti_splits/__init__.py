@@ -27,7 +27,7 @@ CAMERAS = {"l": "02", "r": "03"}
 _LETTERS = {camera: letter for letter, camera in CAMERAS.items()}
 _LINE = re.compile(
     r"(?P<date>[\d_]{10})/(?P<drive>(?P=date)[^/\s]+)/image_(?P<camera>02|03)/data/"
-    r"(?P<number>\d{10})\.png(\s.*)?"
+    r"(?P<number>\d{10})\.(png|jpe?g)(\s.*)?"
 )
 
 

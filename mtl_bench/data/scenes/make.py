@@ -47,10 +47,11 @@ def ensure(
     Raises:
         ValueError: snippets too short to train on, or sizes or counts that cannot be rendered.
     """
-    if data.frames < 3:
+    needed = 2 * data.stride + 1
+    if data.frames < needed:
         raise ValueError(
             f"recipe.data.frames = {data.frames}, but training compares a frame with the one "
-            f"before it and the one after it; set 3 or more"
+            f"before it and the one after it at a stride of {data.stride}; set {needed} or more"
         )
     settings = Settings(
         data.height, data.width, data.train_scenes, data.val_scenes, data.test_scenes, data.seed,

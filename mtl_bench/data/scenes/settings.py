@@ -9,11 +9,11 @@ from typing import Any
 import cv2
 from numpy.typing import NDArray
 
+from mtl_bench.data import png
 from mtl_bench.data.scenes.render import RENDERER_VERSION
 
 CITYSCAPES, KITTI = "Cityscapes", "KITTI raw"  # layouts of files
 SPLITS = ("train", "val", "test")
-_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 2]
 
 
 @dataclass(frozen=True)
@@ -77,5 +77,4 @@ class Settings:
 
 
 def write_png(path: Path, image: NDArray[Any]) -> None:
-    if not cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, _FAST):
-        raise OSError(f"cannot write {path}")
+    path.write_bytes(png.encode(image, cv2.IMWRITE_PNG_COMPRESSION, 2))  # 2: fast

@@ -12,10 +12,10 @@ from mtl_bench.core.config import Cell, did_you_mean
 from mtl_bench.core.dataset import dataset_in, layouts
 from mtl_bench.core.device import Compute, choose_device
 from mtl_bench.core.labels import LabelSet
+from mtl_bench.data import pictures
 from mtl_bench.data.cameras import Mounted
 from mtl_bench.show.predict import Predicted, Predictor
 from mtl_bench.show.predict.cameras import Given, camera_of
-from mtl_bench.show.predict.video import read_image
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def look(predictor: Predictor, name: str, path: Path) -> Shown:
     Raises:
         ValueError: a damaged image or camera file.
     """
-    image_HW3 = read_image(path)
+    image_HW3 = pictures.read(path)
     camera = camera_of(path, (image_HW3.shape[0], image_HW3.shape[1]), Given())
     predicted = predictor(image_HW3, camera.K_33, camera.height_m, camera.pitch_rad)
     return Shown(name, predicted, camera, predictor.labels)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mtl_bench.core import canvas
 from mtl_bench.core.canvas import Image
 from mtl_bench.core.labels import LabelSet
+from mtl_bench.data import png
 from mtl_bench.show.points import View, points_view
 from mtl_bench.show.predict import Predicted
 from mtl_bench.show.predict.point_cloud import POINTS, from_prediction, write_npz, write_ply
@@ -105,9 +106,7 @@ def video_frame(predicted: Predicted) -> Image:
 
 
 def _png(base: Path, what: str, image: NDArray[Any]) -> None:
-    path = _named(base, f"{what}.png")
-    encoded = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)[1]
-    path.write_bytes(encoded.tobytes())
+    _named(base, f"{what}.png").write_bytes(png.encode(image))
 
 
 def _named(base: Path, ending: str) -> Path:

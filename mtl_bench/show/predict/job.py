@@ -20,15 +20,18 @@ from pathlib import Path
 from typing import Any
 
 from mtl_bench.core.canvas import Image
+from mtl_bench.core.files import is_litter
 from mtl_bench.core.view import STEPS, Surface
+from mtl_bench.data import pictures
 from mtl_bench.data.cameras import Mounted
+from mtl_bench.data.video import Reader, Writer
 from mtl_bench.show.predict import Predicted, Predictor
 from mtl_bench.show.predict.cameras import Given, camera_of
 from mtl_bench.show.predict.files import video_frame, write_files
 from mtl_bench.show.predict.recording import Recording, missing
-from mtl_bench.show.predict.video import IMAGE_SUFFIXES, Reader, Writer, is_image, read_image
 
 RECORD = "prediction.json"
+MOST = 0.98  # of the frames that a video announces, by its length: fewer, and it was cut off
 Progress = Callable[[int, int], None]  # frames done, frames in all (0: not known)
 
 
@@ -89,14 +92,20 @@ class Job:
 def predict_images(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, Any]:
     """Predict images one by one and write their files; returns what to record of them.
 
+    An image that cannot be predicted is recorded as failed, and the others go on.
+
     Raises:
-        ValueError: a file that is no image, names that are there twice, impossible cameras.
+        ValueError: names that are there twice, or not one image that can be predicted.
     """
-    images = []
+    images, failed = [], []
     for path, stem in zip(paths, stems_of(paths), strict=True):
-        image_HW3 = read_image(path)
-        camera = camera_of(path, (image_HW3.shape[0], image_HW3.shape[1]), job.given)
-        predicted = job.predict(stem, image_HW3, camera)
+        try:
+            image_HW3 = pictures.read(path)
+            camera = camera_of(path, (image_HW3.shape[0], image_HW3.shape[1]), job.given)
+            predicted = job.predict(stem, image_HW3, camera)
+        except ValueError as error:
+            failed.append({"input": str(path), "why": str(error)})
+            continue
         base = folder / stem
         base.parent.mkdir(parents=True, exist_ok=True)
         write_files(base, predicted, job.kinds, job.predictor.labels)
@@ -106,7 +115,10 @@ def predict_images(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, A
         scale = {"unit": unit, "scale_from": source}
         images.append({**image, "camera": _camera(camera), **scale})
         job.done(len(paths))
-    return {**job.record, "images": images}
+    if not images:
+        others = f" ({len(failed)} images, and none can be predicted)" if len(failed) > 1 else ""
+        raise ValueError(failed[0]["why"] + others)
+    return {**job.record, "images": images, "failed": failed}
 
 
 def predict_video(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, Any]:
@@ -127,12 +139,16 @@ def predict_video(job: Job, paths: Sequence[Path], folder: Path) -> dict[str, An
             write_files(folder / stem, predicted, job.kinds, job.predictor.labels)
             job.done(reader.frames)
     about = {"input": str(path), "size": list(reader.size), "video_fps": reader.fps}
-    return {**job.record, **about, "camera": _camera(camera), "video": video.name}
+    about |= {"camera": _camera(camera), "video": video.name, "failed": []}
+    if job.frames < MOST * reader.frames - 1:
+        why = f"{path}: {job.frames} of {reader.frames} frames can be decoded; is the file whole?"
+        about["failed"] = [{"input": str(path), "why": why}]
+    return {**job.record, **about}
 
 
 def is_video(paths: Sequence[Path]) -> bool:
     """Whether the input is one file that is no image."""
-    return len(paths) == 1 and not is_image(paths[0])
+    return len(paths) == 1 and not pictures.is_image(paths[0])
 
 
 def _camera(camera: Mounted) -> dict[str, Any]:
@@ -171,6 +187,8 @@ def summary(record: dict[str, Any], predictor: Predictor) -> list[str]:
 def find(words: Sequence[str]) -> list[Path]:
     """Files that images, folders (searched to their depths) and patterns mean, in that order.
 
+    Symbolic links are followed; files that only an operating system looks at are left out.
+
     Raises:
         ValueError: nothing there.
     """
@@ -178,18 +196,39 @@ def find(words: Sequence[str]) -> list[Path]:
     for word in words:
         path = Path(word)
         if path.is_dir():
-            inside = sorted(p for p in path.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+            inside = _images_below(path)
             if not inside:
-                raise ValueError(f"{path}: no image in this folder ({', '.join(IMAGE_SUFFIXES)})")
+                raise ValueError(
+                    f"{path}: no image in this folder ({', '.join(pictures.SUFFIXES)})"
+                )
             found += inside
         elif path.is_file():
             found.append(path)
         else:
-            matches = sorted(p for p in _matches(path) if p.is_file())
+            matches = sorted(p for p in _matches(path) if p.is_file() and not is_litter(p.name))
             if not matches:
                 raise ValueError(f"no file, folder or pattern with files '{word}'")
             found += matches
     return found
+
+
+def _images_below(folder: Path) -> list[Path]:
+    """In order; what several links lead to is there once, also where they lead in a circle."""
+    found: list[Path] = []
+    seen: set[Path] = set()
+
+    def refuse(error: OSError) -> None:
+        raise ValueError(f"{error.filename}: cannot be listed ({error.strerror})") from error
+
+    for place, folders, files in os.walk(folder, onerror=refuse, followlinks=True):
+        if (real := Path(place).resolve()) in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        folders[:] = sorted(name for name in folders if not is_litter(name))
+        names = [name for name in files if not is_litter(name)]
+        found += [Path(place, n) for n in names if Path(n).suffix.lower() in pictures.SUFFIXES]
+    return sorted(found)
 
 
 def _matches(pattern: Path) -> Iterator[Path]:
@@ -216,7 +255,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
 
 def stems_of(paths: Sequence[Path]) -> list[str]:
     """Names of outputs: the inputs' below the folder that they have in common."""
-    parents = [path.resolve().parent for path in paths]
+    parents = [Path(os.path.abspath(path)).parent for path in paths]  # noqa: PTH100  links stay
     common = os.path.commonpath(parents)
     stems = [
         (parent / path.stem).relative_to(common).as_posix()

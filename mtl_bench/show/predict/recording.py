@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mtl_bench.core.files import utf8_name
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.view import METRES, Surface
 from mtl_bench.show.predict import Predicted
@@ -33,7 +34,7 @@ class Recording:
 
         self._rerun, self.labels = rerun, labels
         self._stream = rerun.RecordingStream("mtl-bench")
-        self._stream.save(str(path))
+        self._stream.save(utf8_name(path, "Rerun"))
         self._stream.log("world", rerun.ViewCoordinates.RDF, static=True)
         classes = [(label.label_id, label.name, label.color) for label in labels.labels]
         self._stream.log("world", rerun.AnnotationContext(classes), static=True)

@@ -13,7 +13,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -29,10 +28,9 @@ def write_panoptic(out: Path, split: str, frames: Iterable[tuple[str, NDArray[An
     base.mkdir(parents=True, exist_ok=True)
     annotations = []
     for name, ids_HW in frames:
-        bgr_HW3 = np.stack([ids_HW >> 16, ids_HW >> 8 & 255, ids_HW & 255], 2).astype(np.uint8)
+        rgb_HW3 = np.stack([ids_HW & 255, ids_HW >> 8 & 255, ids_HW >> 16], 2).astype(np.uint8)
         file = base / f"{name}_panoptic.png"
-        if not cv2.imwrite(str(file), bgr_HW3):
-            raise ValueError(f"cannot write {file}")
+        file.write_bytes(png.encode(rgb_HW3))
         segments = [
             {"id": value, "category_id": value if value < DIVISOR else value // DIVISOR}
             for value in np.unique(ids_HW).tolist()

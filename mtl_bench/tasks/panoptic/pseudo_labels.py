@@ -29,7 +29,7 @@ from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet
 from mtl_bench.core.plain import to_dict
 from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Maps, Size, Task
-from mtl_bench.data import png
+from mtl_bench.data import pictures, png
 from mtl_bench.tasks.panoptic import grouping
 
 RECORD = "pseudo_labels.json"
@@ -167,7 +167,7 @@ def _predictions(
     for batch, size in batches:
         if done.issuperset(batch):
             continue
-        images = [png.read(frames.image(name), bits=8, color=True) for name in batch]
+        images = [pictures.read(frames.image(name), bits=8) for name in batch]
         image_B3HW = torch.stack([_to_input(image, size) for image in images]).to(device)
         sizes = pass_sizes(recipe, size)
         maps = average(task, model.get_submodule("net"), image_B3HW.float() / 255, sizes, flip)

@@ -1,4 +1,4 @@
-"""Videos in and out, one frame at a time; and single images. RGB, uint8 [H,W,3]."""
+"""Videos in and out, one frame at a time. RGB, uint8 [H,W,3]."""
 
 import math
 import os
@@ -10,27 +10,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mtl_bench.core.files import utf8_name
+
 Image = NDArray[np.uint8]
 CODEC = "mp4v"  # MPEG-4, which every OpenCV can write
 UNKNOWN_FPS = 25.0  # of a video that does not say
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+LARGEST = 65535  # of MPEG-4's clock: a second has so many ticks at most
+SLOWEST = 0.01  # frames a second; OpenCV takes fewer for none
 
 # Of what goes wrong, one line of ours is enough
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-def is_image(path: Path) -> bool:
-    """Whether the file begins like an image."""
-    return bool(cv2.haveImageReader(str(path)))
-
-
-def read_image(path: Path) -> Image:
-    """Raises: ValueError: not an image, or a damaged one."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if is_image(path) else None
-    if image is None:
-        raise ValueError(f"{path}: not an image that OpenCV can read, or a damaged one")
-    return np.ascontiguousarray(image[..., ::-1])
+def representable(fps: float) -> float:
+    """The nearest number of frames a second that MPEG-4 can hold: whole ticks of a clock with
+    10^n a frame, n as large as the clock allows. OpenCV finds the same fraction."""
+    fps = min(max(fps, SLOWEST), float(LARGEST))
+    return next(
+        round(fps * ticks) / ticks for ticks in (1000, 100, 10, 1) if round(fps * ticks) <= LARGEST
+    )
 
 
 class Reader:
@@ -42,7 +41,7 @@ class Reader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._capture = cv2.VideoCapture(str(path))
+        self._capture = cv2.VideoCapture(utf8_name(path, "OpenCV's video"))
         if not self._capture.isOpened():
             raise ValueError(f"{path}: neither an image nor a video that OpenCV can read")
         fps = self._capture.get(cv2.CAP_PROP_FPS)
@@ -74,14 +73,15 @@ class Writer:
     """
 
     def __init__(self, path: Path, fps: float) -> None:
-        self.path, self.fps, self.frames = path, fps, 0
+        self.path, self.fps, self.frames = path, representable(fps), 0
+        self._name = utf8_name(path, "OpenCV's video")
         self._writer: cv2.VideoWriter | None = None
 
     def write(self, image_HW3: Image) -> None:
         if self._writer is None:
             height, width = image_HW3.shape[:2]
             code = cv2.VideoWriter_fourcc(*CODEC)  # type: ignore[attr-defined]
-            self._writer = cv2.VideoWriter(str(self.path), code, self.fps, (width, height))
+            self._writer = cv2.VideoWriter(self._name, code, self.fps, (width, height))
             if not self._writer.isOpened():
                 raise ValueError(f"{self.path}: this OpenCV cannot write {CODEC} videos here")
         self._writer.write(np.ascontiguousarray(image_HW3[..., ::-1]))
@@ -104,7 +104,7 @@ class Writer:
 
     def _check(self) -> None:
         """OpenCV says nothing of a disk that is full."""
-        capture = cv2.VideoCapture(str(self.path))
+        capture = cv2.VideoCapture(self._name)
         written = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
         capture.release()
         if written != self.frames:
