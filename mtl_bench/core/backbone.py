@@ -1,9 +1,12 @@
-"""What a backbone is: an image in, a feature pyramid out, keyed by stride."""
+"""What a backbone is: an image in, a feature pyramid out, keyed by stride; or one vector."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import timm
 from torch import Tensor, nn
+
+VECTOR = 0  # stands for a stride where a backbone gives one vector
 
 
 class Backbone(nn.Module):
@@ -11,7 +14,13 @@ class Backbone(nn.Module):
 
     A subclass sets `channels` and implements `forward`. Its constructor takes `strides`, the
     pyramid levels that will be read (deeper ones need not be built), and `pretrained`.
+
+    One that gives a vector says `vector = True`. Its constructor takes `size`, the input's height
+    and width, and `outputs`, how many numbers the vector has, in place of `strides`; VECTOR is the
+    only key of `channels` and of what `forward` gives, [B, outputs].
     """
+
+    vector: ClassVar[bool] = False
 
     mean: tuple[float, float, float] = (
         0.485,

@@ -40,6 +40,9 @@ GRANULARITIES = ("terms", "tasks")
 LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("data", "train_frames"),
     ("data", "test_scenes"),
+    ("data", "heads"),
+    ("data", "cosine"),
+    ("data", "norm_ratio"),
     ("evaluate", "protocol"),
     ("evaluate", "also"),
     ("evaluate", "flip"),
@@ -117,7 +120,7 @@ class Cell:
 def canonical_json(cell: Cell) -> str:
     """What makes a cell itself: without names, prose and how often a checkpoint is written."""
     values = to_dict(cell)
-    for key in ("name", "about", "tasks"):
+    for key in ("name", "about", "tasks", "backbone"):
         del values["recipe"][key]
     for key in ("checkpoint_every", "cosine_every"):
         del values["recipe"]["optim"][key]

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, plugins
-from mtl_bench.core.backbone import Backbone
+from mtl_bench.core.backbone import VECTOR, Backbone
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.task import Maps, Task, TaskHead
 from mtl_bench.model.layers import GlobalContext, Normalize, init_fan_in
@@ -35,9 +35,14 @@ class Network(nn.Module):
         self.normalize = Normalize(backbone.mean, backbone.std)
         self.backbone = backbone
         self.strides = sizes.strides
-        inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
-        assert len(inputs) == 3
-        self.context = GlobalContext(inputs[2], sizes.channels)
+        self.context: nn.Module
+        inputs: tuple[int, ...] = ()
+        if backbone.vector:
+            self.context = nn.Identity()  # the vector is the context
+        else:
+            inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
+            assert len(inputs) == 3
+            self.context = GlobalContext(inputs[2], sizes.channels)
         init_fan_in(self.context)
         self.tasks = tuple(tasks)
         # All decoders come before all heads, under names of their own: so checkpoints have them.
@@ -74,6 +79,8 @@ class Network(nn.Module):
     def features(self, normalized_B3HW: Tensor) -> tuple[list[Tensor], Tensor]:
         """What decoders read of a normalised image: the pyramid, finest first, and the context."""
         features = self.backbone(normalized_B3HW)
+        if VECTOR in features:
+            return [], self.context(features[VECTOR][..., None, None])
         pyramid = [features[stride] for stride in self.strides]
         return pyramid, self.context(pyramid[2])
 
@@ -189,14 +196,24 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
         ValueError: an unknown backbone, or an input that the pyramid does not divide.
     """
     sizes, data = cell.recipe.network, cell.recipe.data
-    if data.height % sizes.strides[2] or data.width % sizes.strides[2]:
+    kind = plugins.load("backbones", cell.backbone)
+    given: dict[str, Any] = {"pretrained": cell.pretrained, **cell.backbone_args}
+    if kind.vector:
+        for task in tasks:
+            if task.reads_pyramid:
+                raise ValueError(
+                    f"task '{task.name}' reads maps, and backbone '{cell.backbone}' gives one "
+                    f"vector: choose another backbone"
+                )
+        given |= {"size": (data.height, data.width), "outputs": sizes.channels}
+    elif data.height % sizes.strides[2] or data.width % sizes.strides[2]:
         raise ValueError(
             f"input {data.height}x{data.width} is not divisible by the deepest stride "
             f"{sizes.strides[2]}: change data.height, data.width or network.strides"
         )
-    kind = plugins.load("backbones", cell.backbone)
-    backbone = kind(strides=sizes.strides, pretrained=cell.pretrained, **cell.backbone_args)
-    model = Model(Network(backbone, sizes, tasks), tasks)
+    else:
+        given["strides"] = sizes.strides
+    model = Model(Network(kind(**given), sizes, tasks), tasks)
     for task in tasks:
         model.add_extra(task, task.extra(sizes, cell.pretrained == "timm"))
     for module in model.modules():
@@ -213,5 +230,7 @@ def side_by_side(models: Iterable[Model]) -> Model:
 
 
 def _resize(x_BCHW: Tensor, size: torch.Size) -> Tensor:
-    """To the input's size, in float32 and with the paper's alignment of corners."""
+    """To the input's size, in float32, with the paper's alignment of corners; a vector stays."""
+    if x_BCHW.dim() == 2:
+        return x_BCHW.float()
     return F.interpolate(x_BCHW.float(), size, mode="bilinear", align_corners=True)

@@ -4,9 +4,22 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch import Tensor
+
+from mtl_bench.core.backbone import VECTOR, Backbone
+
+SIZE = (64, 64)  # of the images
 
 
-def _pyramid(kind: Callable[..., Any]) -> None:
+def _features(kind: type[Backbone]) -> None:
+    """A pyramid, or a vector, of the declared shapes."""
+    if kind.vector:
+        for size, outputs in ((SIZE, 8), ((16, 32), 5)):
+            backbone = kind(size=size, outputs=outputs).eval()
+            found = {key: tuple(f.shape) for key, f in backbone(torch.rand(2, 3, *size)).items()}
+            if found != {VECTOR: (2, outputs)} or backbone.channels != {VECTOR: outputs}:
+                raise ValueError(f"{found} is not a vector of {outputs}, or not under VECTOR")
+        return
     for strides in ((8, 16, 32), (4, 8, 16), (2, 4, 8)):
         backbone = kind(strides=strides).eval()
         for height, width in ((64, 64), (96, 160)):
@@ -19,15 +32,16 @@ def _pyramid(kind: Callable[..., Any]) -> None:
 
 
 def _every_parameter_trains(kind: Callable[..., Any]) -> None:
-    backbone = kind(strides=(8, 16, 32)).train()
-    sum(f.square().mean() for f in backbone(torch.rand(2, 3, 64, 64)).values()).backward()
+    backbone = (kind(size=SIZE) if kind.vector else kind(strides=(8, 16, 32))).train()
+    features: dict[int, Tensor] = backbone(torch.rand(2, 3, *SIZE))
+    sum(f.square().mean() for f in features.values()).backward()
     idle = [name for name, p in backbone.named_parameters() if p.grad is None]
     if idle:
         raise ValueError(f"parameters without a gradient: {', '.join(idle[:5])}")
 
 
 def _backbone_round_trip(kind: Callable[..., Any]) -> None:
-    first, second, image = kind().eval(), kind().eval(), torch.rand(1, 3, 64, 64)
+    first, second, image = kind().eval(), kind().eval(), torch.rand(1, 3, *SIZE)
     second.load_state_dict(first.state_dict())
     for stride, features in first(image).items():
         if not torch.equal(features, second(image)[stride]):
@@ -35,7 +49,7 @@ def _backbone_round_trip(kind: Callable[..., Any]) -> None:
 
 
 BACKBONE_CHECKS: dict[str, Callable[[Callable[..., Any]], None]] = {
-    "pyramid as declared": _pyramid,
+    "features as declared": _features,
     "every parameter trains": _every_parameter_trains,
     "state round trip": _backbone_round_trip,
 }
