@@ -127,8 +127,9 @@ class Samples:
         return sample
 
 
-def _camera(frame: DecodedFrame, K_33: Tensor | None) -> Camera | None:
+def _camera(frame: DecodedFrame, K_33: Tensor | None) -> Camera:
+    """Where a frame has none, one that nothing reads."""
     if K_33 is None:
-        return None
+        return Camera(torch.eye(3), torch.tensor(1.0), torch.tensor(0.0))
     height, pitch = frame.camera_height_m, frame.camera_pitch_rad
     return Camera(K_33, torch.tensor(height), torch.tensor(pitch))

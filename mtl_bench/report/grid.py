@@ -4,7 +4,7 @@ Cells of different status never share a line, and neither do measured, trivial a
 """
 
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -136,6 +136,10 @@ class Results:
             if part in (None, column.part)
             and any(g.entries[column.name].count for g in self.groups)
         ]
+
+    def tasks(self) -> set[str]:
+        """Those that some group has a metric of."""
+        return {column.task for column in self.columns("quality")}
 
 
 def tabulate(
@@ -325,7 +329,7 @@ def footnotes(results: Results) -> Iterator[str]:
     if results.reference is not None:
         yield from _relative(results, results.reference)
     if results.baseline:
-        yield _trivial()
+        yield _trivial(results.tasks())
     stale = [row for group in groups if group.status == "stale" for row in group.rows]
     if stale:
         why = ", ".join(dict.fromkeys(str(row["error"]) for row in stale if row.get("error")))
@@ -473,10 +477,10 @@ def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, 
     return captions
 
 
-def _trivial() -> str:
-    made = " and ".join(sorted(quality.words("trivial")))
+def _trivial(tasks: Collection[str]) -> str:
+    made = " and ".join(sorted(quality.words("trivial", tasks)))
     note = f"Trivial predictor: the training split's {made}. It looks at no image; a network has to"
-    return " ".join([f"{note} beat it.", *quality.words("trivial_note")])
+    return " ".join([f"{note} beat it.", *quality.words("trivial_note", tasks)])
 
 
 def counted_images(results: Results) -> Section | None:
@@ -490,7 +494,7 @@ def counted_images(results: Results) -> Section | None:
             sums = [Cell(f"{sum(several):g}" if several else NOTHING) for several in found]
             lines.append(TableRow.of(group.label, *sums))
     heads = (*Head.words(axis_title(results.axes[0])), *map(Head, counts.values()))
-    title = f"{'; '.join(quality.words('counted'))} (all seeds together)"
+    title = f"{'; '.join(quality.words('counted', results.tasks()))} (all seeds together)"
     return Section(title, heads, tuple(lines)) if lines else None
 
 
