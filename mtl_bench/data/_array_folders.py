@@ -1,4 +1,4 @@
-"""Readers of dense data sets that are distributed as NumPy arrays, one file a frame and a field.
+"""Dense data sets that are distributed as NumPy arrays, one file a frame and a field.
 
     {train,val}/<folder>/N.npy      N from 0, height x width (x channels) of a frame
 
@@ -10,7 +10,6 @@ no validation split: a fifth of `train`, drawn with a fixed seed, is split "val"
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -112,7 +111,7 @@ class ArrayFolders(Dataset):
             array = self._at_input(array, cv2.INTER_NEAREST_EXACT) if self.training else array
             value = torch.from_numpy(np.ascontiguousarray(array))
             fields[field] = value.permute(2, 0, 1).contiguous() if value.dim() == 3 else value
-        shrinks = own > (self.data.height, self.data.width)
+        shrinks = own[0] * own[1] > self.data.height * self.data.width
         image_HW3 = self._at_input(image_HW3, cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         return DecodedFrame([torch.from_numpy(image_HW3).permute(2, 0, 1)], fields=fields)
 
@@ -154,15 +153,6 @@ def validation(names: list[str]) -> frozenset[str]:
 
 
 # --- arrays ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Header:
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-
-    def __str__(self) -> str:
-        return f"{self.dtype} {_times(self.shape)}"
 
 
 def load(path: Path, channels: int) -> NDArray[Any]:
@@ -209,9 +199,10 @@ def read_labels(path: Path, classes: int) -> NDArray[np.int32]:
     if low < -1 or high >= classes or (labels != np.rint(labels)).any():
         raise ValueError(
             f"{path}: labels from {low:g} to {high:g}, not whole numbers from -1 (none) to "
-            f"{classes - 1}: these are not the labels of {classes} classes"
+            f"{classes - 1}: put the folder with labels of {classes} classes in its place"
         )
-    return np.where(labels < 0, IGNORE, labels).astype(np.int32)
+    labels = labels.astype(np.int32)
+    return np.where(labels < 0, IGNORE, labels)
 
 
 def read_depth(path: Path, kind: Kind) -> NDArray[np.float32]:

@@ -13,10 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, plugins
-from mtl_bench.core.backbone import Backbone
+from mtl_bench.core.backbone import Backbone, divisor_of
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.task import Maps, Task, TaskHead
-from mtl_bench.model.layers import GlobalContext, Normalize, init_fan_in
+from mtl_bench.model.layers import MGNET, Decoder, GlobalContext, Normalize, init_fan_in
 
 
 @dataclass
@@ -36,15 +36,21 @@ class Network(nn.Module):
         self.backbone = backbone
         self.strides = sizes.strides
         inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
-        assert len(inputs) == 3
-        self.context = GlobalContext(inputs[2], sizes.channels)
-        init_fan_in(self.context)
+        self.context: GlobalContext | None = None
+        if sizes.decoder == MGNET:
+            self.context = GlobalContext(inputs[-1], sizes.channels)
+            init_fan_in(self.context)
         self.tasks = tuple(tasks)
         # All decoders come before all heads, under names of their own: so checkpoints have them.
         self.decoders, self.heads = nn.ModuleDict(), nn.ModuleDict()
         self._parts: dict[str, TaskHead] = {}
         for task in tasks:
             part = task.head(inputs, sizes)
+            if self.context is None and any(isinstance(m, Decoder) for m in part.modules()):
+                raise ValueError(
+                    f"network.decoder = '{sizes.decoder}', but task '{task.name}' has decoders of "
+                    f"its own: set it to '{MGNET}'"
+                )
             for own, ours in ((part.decoders, self.decoders), (part.heads, self.heads)):
                 taken = own.keys() & ours.keys()
                 if taken:
@@ -72,10 +78,13 @@ class Network(nn.Module):
             task.like_trained(self._parts[task.name], maps[task.name])
 
     def features(self, normalized_B3HW: Tensor) -> tuple[list[Tensor], Tensor]:
-        """What decoders read of a normalised image: the pyramid, finest first, and the context."""
+        """What decoders read of a normalised image: the pyramid, finest first, and the context,
+        which is empty where none reads it."""
         features = self.backbone(normalized_B3HW)
         pyramid = [features[stride] for stride in self.strides]
-        return pyramid, self.context(pyramid[2])
+        return pyramid, pyramid[-1].new_empty(0) if self.context is None else self.context(
+            pyramid[-1]
+        )
 
     def raw(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> dict[str, Maps]:
         """Every task's raw maps [B,C,h,w]."""
@@ -91,7 +100,7 @@ class Network(nn.Module):
             # Views: a gradient with respect to the last level then leaves out its way through the
             # context module, which has a gradient of its own.
             *pyramid, context = (x.view_as(x) for x in (*pyramid, context))
-            outputs.representation = [*pyramid, context]
+            outputs.representation = [*pyramid, *([context] if self.context is not None else [])]
         raw = self.raw(pyramid, context)
         for task in self.tasks:
             maps = task.activate(raw[task.name])
@@ -164,7 +173,8 @@ class Model(nn.Module):
         """Encoder and context module: what all tasks train."""
         assert isinstance(self.net, Network)
         yield from self.net.backbone.parameters()
-        yield from self.net.context.parameters()
+        if self.net.context is not None:
+            yield from self.net.context.parameters()
 
     def task_parameters(self) -> Iterator[nn.Parameter]:
         """Decoders, heads and further networks: each trained by one task only."""
@@ -189,12 +199,19 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
         ValueError: an unknown backbone, or an input that the pyramid does not divide.
     """
     sizes, data = cell.recipe.network, cell.recipe.data
-    if data.height % sizes.strides[2] or data.width % sizes.strides[2]:
+    kind = plugins.load("backbones", cell.backbone)
+    lacking = sorted(set(sizes.strides) - set(kind.levels))
+    if lacking:
+        raise ValueError(
+            f"backbone '{cell.backbone}' has no features at stride {lacking[0]}: set "
+            f"network.strides to some of {', '.join(map(str, kind.levels))}"
+        )
+    divisor = divisor_of(cell)
+    if data.height % divisor or data.width % divisor:
         raise ValueError(
             f"input {data.height}x{data.width} is not divisible by the deepest stride "
-            f"{sizes.strides[2]}: change data.height, data.width or network.strides"
+            f"{divisor}: change data.height, data.width or network.strides"
         )
-    kind = plugins.load("backbones", cell.backbone)
     backbone = kind(strides=sizes.strides, pretrained=cell.pretrained, **cell.backbone_args)
     model = Model(Network(backbone, sizes, tasks), tasks)
     for task in tasks:

@@ -4,7 +4,7 @@
     {train,val}/{image,label_7,label_19,depth}/N.npy            Cityscapes
 
 `train` holds the training and the validation scenes, since those archives have no validation split,
-and `val` the test scenes. Images are float32 in [0, 1]. Depth is in metres; Cityscapes' is a
+and `val` the test scenes. Images are float32 in [0, 1]. Depth is in metres up to 80; Cityscapes' is a
 disparity / 65535 as its camera of 2048 pixels would have it, in its steps. The sky and the ego
 vehicle have neither depth nor normal (0), the ego vehicle no label (-1).
 """
@@ -22,6 +22,7 @@ from mtl_bench.data.scenes.cityscapes import encode_disparity
 from mtl_bench.data.scenes.settings import NYUV2, Settings
 
 PUBLISHED_WIDTH = 2048  # of Cityscapes' images, which its disparities are pixels of
+FARTHEST_M = 80.0  # a sensor's reach: what is beyond has no depth
 NONE = -1
 _ROLES = {"road": GROUND, "sky": NO_SURFACE}
 _JOINED = {  # Cityscapes' class -> the one of 13 that it is part of
@@ -62,7 +63,8 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
     fields = {"image": render.image(scene, frame).astype(np.float32) / 255}
     if settings.layout == NYUV2:
         fields["label"] = _TABLES["label"][seen.label_HW]
-        fields["depth"] = seen.depth_HW[..., None]
+        near_HW = np.where(seen.depth_HW <= FARTHEST_M, seen.depth_HW, 0)
+        fields["depth"] = near_HW[..., None]
         fields["normal"] = render.normals(scene, frame, seen)
     else:
         fields |= {name: _TABLES[name][seen.label_HW] for name in ("label_7", "label_19")}
