@@ -1,4 +1,4 @@
-"""What a backbone is: an image in, a feature pyramid out, keyed by stride."""
+"""What a backbone is: an image in, a feature pyramid out, keyed by stride; or one vector."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -9,13 +9,21 @@ from torch import Tensor, nn
 from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell
 
+VECTOR = 0  # stands for a stride where a backbone gives one vector
+
 
 class Backbone(nn.Module):
     """Base of every file in `backbones/`.
 
     A subclass sets `channels` and implements `forward`. Its constructor takes `strides`, the
     pyramid levels that will be read (deeper ones need not be built), and `pretrained`.
+
+    One that gives a vector says `vector = True`. Its constructor takes `size`, the input's height
+    and width, and `outputs`, how many numbers the vector has, in place of `strides`; VECTOR is the
+    only key of `channels` and of what `forward` gives, [B, outputs].
     """
+
+    vector: ClassVar[bool] = False
 
     mean: tuple[float, float, float] = (
         0.485,
@@ -81,4 +89,4 @@ class TimmBackbone(Backbone):
 def divisor_of(cell: Cell) -> int:
     """What the height and width of a cell's images are multiples of."""
     backbone = plugins.load("backbones", cell.backbone)
-    return int(max(cell.recipe.network.strides[-1], backbone.divisor))
+    return 1 if backbone.vector else int(max(cell.recipe.network.strides[-1], backbone.divisor))

@@ -43,6 +43,9 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("network", "decoder"),
     ("optim", "milestones"),
     ("optim", "milestone_factor"),
+    ("data", "heads"),
+    ("data", "cosine"),
+    ("data", "norm_ratio"),
     ("evaluate", "protocol"),
     ("evaluate", "also"),
     ("evaluate", "flip"),
@@ -120,7 +123,7 @@ class Cell:
 def canonical_json(cell: Cell) -> str:
     """What makes a cell itself: without names, prose and how often a checkpoint is written."""
     values = to_dict(cell)
-    for key in ("name", "about", "tasks"):
+    for key in ("name", "about", "tasks", "backbone"):
         del values["recipe"][key]
     for key in ("checkpoint_every", "cosine_every"):
         del values["recipe"]["optim"][key]

@@ -75,10 +75,30 @@ def in_turns(several: Iterable[Sequence[T]]) -> list[T]:
 
 
 def columns_of(task: str, name: str = "columns") -> list[Column]:
-    """A task's columns; an heir's come after those of the task that it derives from."""
+    """A task's columns; an heir's come after those of the task that it derives from.
+
+    One that is of a field has them once for each field that a data set has for it.
+    """
     text = plugins.path_of("tasks", task).read_bytes()
     inherited = [c for base in plugins.bases("tasks", text) for c in columns_of(base, name)]
-    return [*inherited, *(replace(c, task=task) for c in _read(task, text, name) or ())]
+    own = [*inherited, *(replace(c, task=task) for c in _read(task, text, name) or ())]
+    if not plugins.attributes("tasks", task).get("of_field"):
+        return own
+    datasets = [plugins.attributes("datasets", name) for name in plugins.readable("datasets")]
+    several = [facts.get("predicts", {}).get(task, ()) for facts in datasets]
+    fields = dict.fromkeys(itertools.chain.from_iterable(several))
+    return [_of_field(column, field) for field in fields for column in own]
+
+
+def _of_field(column: Column, field: str) -> Column:
+    """`regress.rmse` of the field y0 is `regress.y0.rmse`."""
+    return replace(
+        column,
+        name=f"{field}_{column.name}",
+        key=column.key.replace(".", f".{field}.", 1),
+        title=f"{field.replace('_', ' ')} {column.title}",
+        task=f"{column.task}:{field}",
+    )
 
 
 def _columns(name: str) -> list[Column]:

@@ -19,6 +19,9 @@ class Data:
     frames: int = 3  # synthetic only: length of a snippet; the video stage needs 4 or more
     seed: int = 0  # synthetic only: which world
     train_frames: str = "published"  # KITTI only: published (the split's) | all (with neighbours)
+    heads: int = 10  # made regressions only: how many
+    cosine: float = 0.0  # made regressions only: of any two of their functions
+    norm_ratio: float = 10.0  # made regressions only: of the last one's scale to the first one's
     cache: bool = True  # keep decoded frames in memory
     workers: int = 0  # data-loading processes; 0 = in the training process
 
@@ -35,6 +38,12 @@ class Augment:
     saturation: float = 0.2
     hue: float = 0.05
 
+    @property
+    def nothing(self) -> bool:
+        """Whether every sample is its frame, unchanged."""
+        widths = (self.brightness, self.contrast, self.saturation, self.hue)
+        return not (self.flip or self.crop or any(widths)) and self.scales == (1.0,)
+
 
 @dataclass(frozen=True)
 class Network:
@@ -42,7 +51,8 @@ class Network:
 
     strides: tuple[int, ...] = (8, 16, 32)  # pyramid levels that the decoders read
     decoder: str = "mgnet"  # of three levels | aspp, of the deepest one | none: the finest as it is
-    channels: int = 128  # ARM, refinement and GCM; ASPP's branches
+    # ARM, refinement and GCM; ASPP's branches; the vector of a backbone that gives one
+    channels: int = 128
     fused: int = 256  # FFM output
     head: int = 256  # hidden width of a head
     pose: str = "resnet18"  # pose encoder: resnet18 (the paper's) | light
@@ -131,6 +141,7 @@ class Recipe:
     about: str = ""
     smoke: bool = False  # marks rows that must never be read as results
     tasks: tuple[str, ...] = ("panoptic", "depth")  # of a cell that names none
+    backbone: str = ""  # of a cell that names none, and of a grid that is run with --recipe
     data: Data = field(default_factory=Data)
     augment: Augment = field(default_factory=Augment)
     network: Network = field(default_factory=Network)

@@ -200,6 +200,27 @@ class DenseHead(TaskHead):
         return {self.name: self.heads[self.name](features_BChw)}
 
 
+class VectorHead(TaskHead):
+    """A linear layer on the context: numbers of the whole image.
+
+    Args:
+        name: of the task.
+        map_: what its numbers are called.
+        outputs: how many they are.
+    """
+
+    def __init__(self, name: str, map_: str, sizes: Network, outputs: int):
+        super().__init__()
+        self.name, self.map = name, map_
+        self.decoders = nn.ModuleDict()
+        self.heads = nn.ModuleDict({name: nn.Linear(sizes.channels, outputs)})
+
+    def forward(
+        self, pyramid: Sequence[Tensor], context_BC11: Tensor, auxiliary: bool = False
+    ) -> Maps:
+        return {self.map: self.heads[self.name](context_BC11.flatten(1))}
+
+
 def init_fan_in(module: nn.Module) -> None:
     """Normal weights of standard deviation 1/sqrt(fan_in), zero bias: the paper's initialisation
     of every decoder and head but depth's."""

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, plugins
-from mtl_bench.core.backbone import Backbone, divisor_of
+from mtl_bench.core.backbone import VECTOR, Backbone, divisor_of
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.task import Maps, Task, TaskHead
 from mtl_bench.model.layers import MGNET, Decoder, GlobalContext, Normalize, init_fan_in
@@ -35,11 +35,15 @@ class Network(nn.Module):
         self.normalize = Normalize(backbone.mean, backbone.std)
         self.backbone = backbone
         self.strides = sizes.strides
-        inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
-        self.context: GlobalContext | None = None
-        if sizes.decoder == MGNET:
-            self.context = GlobalContext(inputs[-1], sizes.channels)
-            init_fan_in(self.context)
+        inputs: tuple[int, ...] = ()
+        self.context: nn.Module | None = None  # None where no decoder reads it
+        if backbone.vector:
+            self.context = nn.Identity()  # the vector is the context
+        else:
+            inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
+            if sizes.decoder == MGNET:
+                self.context = GlobalContext(inputs[-1], sizes.channels)
+                init_fan_in(self.context)
         self.tasks = tuple(tasks)
         # All decoders come before all heads, under names of their own: so checkpoints have them.
         self.decoders, self.heads = nn.ModuleDict(), nn.ModuleDict()
@@ -81,6 +85,8 @@ class Network(nn.Module):
         """What decoders read of a normalised image: the pyramid, finest first, and the context,
         which is empty where none reads it."""
         features = self.backbone(normalized_B3HW)
+        if VECTOR in features:
+            return [], self.context(features[VECTOR][..., None, None])
         pyramid = [features[stride] for stride in self.strides]
         return pyramid, pyramid[-1].new_empty(0) if self.context is None else self.context(
             pyramid[-1]
@@ -200,20 +206,30 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
     """
     sizes, data = cell.recipe.network, cell.recipe.data
     kind = plugins.load("backbones", cell.backbone)
-    lacking = sorted(set(sizes.strides) - set(kind.levels))
-    if lacking:
-        raise ValueError(
-            f"backbone '{cell.backbone}' has no features at stride {lacking[0]}: set "
-            f"network.strides to some of {', '.join(map(str, kind.levels))}"
-        )
+    given: dict[str, Any] = {"pretrained": cell.pretrained, **cell.backbone_args}
+    if kind.vector:
+        for task in tasks:
+            if task.reads_pyramid:
+                raise ValueError(
+                    f"task '{task.name}' reads maps, and backbone '{cell.backbone}' gives one "
+                    f"vector: choose another backbone"
+                )
+        given |= {"size": (data.height, data.width), "outputs": sizes.channels}
+    else:
+        lacking = sorted(set(sizes.strides) - set(kind.levels))
+        if lacking:
+            raise ValueError(
+                f"backbone '{cell.backbone}' has no features at stride {lacking[0]}: set "
+                f"network.strides to some of {', '.join(map(str, kind.levels))}"
+            )
+        given["strides"] = sizes.strides
     divisor = divisor_of(cell)
     if data.height % divisor or data.width % divisor:
         raise ValueError(
             f"input {data.height}x{data.width} is not divisible by the deepest stride "
             f"{divisor}: change data.height, data.width or network.strides"
         )
-    backbone = kind(strides=sizes.strides, pretrained=cell.pretrained, **cell.backbone_args)
-    model = Model(Network(backbone, sizes, tasks), tasks)
+    model = Model(Network(kind(**given), sizes, tasks), tasks)
     for task in tasks:
         model.add_extra(task, task.extra(sizes, cell.pretrained == "timm"))
     for module in model.modules():
@@ -230,5 +246,7 @@ def side_by_side(models: Iterable[Model]) -> Model:
 
 
 def _resize(x_BCHW: Tensor, size: torch.Size) -> Tensor:
-    """To the input's size, in float32 and with the paper's alignment of corners."""
+    """To the input's size, in float32, with the paper's alignment of corners; a vector stays."""
+    if x_BCHW.dim() == 2:
+        return x_BCHW.float()
     return F.interpolate(x_BCHW.float(), size, mode="bilinear", align_corners=True)

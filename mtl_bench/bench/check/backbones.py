@@ -4,9 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch import Tensor
+
+from mtl_bench.core.backbone import VECTOR, Backbone
+
+SIZE = (64, 64)  # of the images
 
 from mtl_bench.core.backbone import Backbone
-
 
 def _strides(kind: type[Backbone]) -> list[tuple[int, ...]]:
     """Three levels where it can give so many, else what it gives."""
@@ -14,7 +18,15 @@ def _strides(kind: type[Backbone]) -> list[tuple[int, ...]]:
     return [three for three in several if set(three) <= set(kind.levels)] or [kind.levels]
 
 
-def _pyramid(kind: type[Backbone]) -> None:
+def _features(kind: type[Backbone]) -> None:
+    """A pyramid, or a vector, of the declared shapes."""
+    if kind.vector:
+        for size, outputs in ((SIZE, 8), ((16, 32), 5)):
+            backbone = kind(size=size, outputs=outputs).eval()
+            found = {key: tuple(f.shape) for key, f in backbone(torch.rand(2, 3, *size)).items()}
+            if found != {VECTOR: (2, outputs)} or backbone.channels != {VECTOR: outputs}:
+                raise ValueError(f"{found} is not a vector of {outputs}, or not under VECTOR")
+        return
     for strides in _strides(kind):
         backbone = kind(strides=strides).eval()
         for height, width in ((64, 64), (96, 160)):
@@ -27,15 +39,16 @@ def _pyramid(kind: type[Backbone]) -> None:
 
 
 def _every_parameter_trains(kind: type[Backbone]) -> None:
-    backbone = kind(strides=_strides(kind)[0]).train()
-    sum(f.square().mean() for f in backbone(torch.rand(2, 3, 64, 64)).values()).backward()
+    backbone = (kind(size=SIZE) if kind.vector else kind(strides=_strides(kind)[0])).train()
+    features: dict[int, Tensor] = backbone(torch.rand(2, 3, *SIZE))
+    sum(f.square().mean() for f in features.values()).backward()
     idle = [name for name, p in backbone.named_parameters() if p.grad is None]
     if idle:
         raise ValueError(f"parameters without a gradient: {', '.join(idle[:5])}")
 
 
 def _backbone_round_trip(kind: Callable[..., Any]) -> None:
-    first, second, image = kind().eval(), kind().eval(), torch.rand(1, 3, 64, 64)
+    first, second, image = kind().eval(), kind().eval(), torch.rand(1, 3, *SIZE)
     second.load_state_dict(first.state_dict())
     for stride, features in first(image).items():
         if not torch.equal(features, second(image)[stride]):
@@ -43,7 +56,7 @@ def _backbone_round_trip(kind: Callable[..., Any]) -> None:
 
 
 BACKBONE_CHECKS: dict[str, Callable[[Callable[..., Any]], None]] = {
-    "pyramid as declared": _pyramid,
+    "features as declared": _features,
     "every parameter trains": _every_parameter_trains,
     "state round trip": _backbone_round_trip,
 }

@@ -1,7 +1,11 @@
-"""What every task has to hold, tried on the built-in data with a small network."""
+"""What every task has to hold, tried on data at hand with a small network."""
 
+import atexit
 import functools
+import shutil
+import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -10,8 +14,9 @@ from torch import Tensor
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.dataset import NEIGHBOURS, dataset_of
-from mtl_bench.core.plugins import files
+from mtl_bench.core.plugins import files, load
 from mtl_bench.core.quality import columns_of
+from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Results, Task, tasks_of, terms_of
 from mtl_bench.data.loader import eval_batches, train_batches
 from mtl_bench.data.samples import open_samples
@@ -21,30 +26,55 @@ from mtl_bench.model import Model, build_model
 RECIPE, BACKBONE = "smoke", "tiny"
 
 
+def _recipe(kind: type[Task]) -> tuple[Recipe, str] | None:
+    """The smoke recipe with a data set at hand that has what a task needs, and the task's field."""
+    smoke, wanted = load_recipe(RECIPE), kind.needs | kind.truth
+    first = smoke.data.dataset.replace("-", "_")
+    for name in (first, *(name for name in files("datasets") if name != first)):
+        dataset = load("datasets", name)
+        fields = dataset.predicts.get(kind.name, ()) if kind.of_field else ("",)
+        has = dataset.fields.keys() | ({NEIGHBOURS} if name == first else set())
+        if fields and wanted <= has:
+            data = replace(smoke.data, dataset=name.replace("_", "-"))
+            recipe = replace(smoke, data=data)
+            if _root(recipe) is not None:
+                return recipe, fields[0]
+    return None
+
+
 @functools.cache
-def _root() -> Path:
-    recipe = load_recipe(RECIPE)
-    return dataset_of(recipe).render(recipe.data, quiet=True)
+def _root(recipe: Recipe) -> Path | None:
+    """A few frames: rendered, or the example that the data set writes, where it does."""
+    dataset = dataset_of(recipe)
+    if dataset.built_in:
+        return dataset.render(recipe.data, quiet=True)
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder)
+    return folder if dataset.example(folder, recipe.data) else None
 
 
 def _model(kind: type[Task]) -> Model:
     """A network with this task and those whose results it reads."""
-    recipe = load_recipe(RECIPE)
-    names = (kind.name, *(name for name in kind.after if name in files("tasks")))
+    found = _recipe(kind)
+    assert found is not None
+    recipe, field = found
+    own = f"{kind.name}:{field}" if field else kind.name
+    names = (own, *(name for name in kind.after if name in files("tasks")))
     tasks = tasks_of(recipe, names, dataset_of(recipe).labels)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return build_model(Cell(recipe, BACKBONE, "", names), tasks)
 
 
-def _on_built_in(check: Callable[[type[Task]], None]) -> Callable[[type[Task]], str | None]:
-    """Only where the built-in data have what the task needs."""
+def _on_data(check: Callable[[type[Task]], None]) -> Callable[[type[Task]], str | None]:
+    """Only where some data have what the task needs."""
 
     def checked(kind: type[Task]) -> str | None:
-        has = dataset_of(load_recipe(RECIPE)).fields.keys() | {NEIGHBOURS}
-        lacking = sorted((kind.needs | kind.truth) - has)
-        if lacking:
-            return f"not tried: the built-in data have no {', '.join(lacking)}"
+        if _recipe(kind) is None:
+            lacking = sorted(
+                (kind.needs | kind.truth) - dataset_of(load_recipe(RECIPE)).fields.keys()
+            )
+            return f"not tried: no data set at hand has {', '.join(lacking) or 'a field for it'}"
         check(kind)
         return None
 
@@ -52,9 +82,10 @@ def _on_built_in(check: Callable[[type[Task]], None]) -> Callable[[type[Task]], 
 
 
 def _batch(model: Model, training: bool) -> Batch:
-    recipe = load_recipe(RECIPE)
-    split = "train" if training else recipe.evaluate.split
-    samples = open_samples(recipe, model.tasks, split, _root(), training)
+    recipe = model.tasks[0].recipe
+    split, root = "train" if training else recipe.evaluate.split, _root(recipe)
+    assert root is not None
+    samples = open_samples(recipe, model.tasks, split, root, training)
     if training:
         for task in model.tasks:
             task.begin(samples.dataset)
@@ -63,7 +94,7 @@ def _batch(model: Model, training: bool) -> Batch:
 
 
 def _own(model: Model, kind: type[Task]) -> Task:
-    return next(task for task in model.tasks if task.name == kind.name)
+    return next(task for task in model.tasks if isinstance(task, kind))
 
 
 def _declared(kind: type[Task]) -> None:
@@ -85,11 +116,12 @@ def _losses(kind: type[Task]) -> None:
     wanted = {term.name for term in terms_of(model.tasks)}
     if set(losses) != wanted:
         raise ValueError(f"losses {sorted(losses)} are not the terms {sorted(wanted)}")
-    own = [losses[term.name] for term in kind.terms]
+    task = _own(model, kind)
+    own = [losses[term.name] for term in task.terms]
     if not all(loss.dim() == 0 and torch.isfinite(loss) for loss in own):
         raise ValueError(f"losses {[loss.tolist() for loss in own]} are no finite scalars")
     torch.stack(own).sum().backward()
-    heads = _own(model, kind).head((8, 8, 8), load_recipe(RECIPE).network).heads
+    heads = task.head((8, 8, 8), task.recipe.network).heads
     trained = {
         name.split(".")[1]
         for name, parameter in model.net.named_parameters()
@@ -108,7 +140,8 @@ def _measures(kind: type[Task]) -> None:
     """Results have one entry a frame; the metrics have the columns; two halves add up."""
     model = _model(kind)
     batch = _batch(model, training=False)
-    found, task = _results(model, batch)[kind.name], _own(model, kind)
+    task = _own(model, kind)
+    found = _results(model, batch)[task.name]
     uneven = [name for name, value in found.items() if len(value) != len(batch.names)]
     if uneven:
         raise ValueError(f"results {', '.join(uneven)} have not one entry a frame")
@@ -131,9 +164,10 @@ def _batched(kind: type[Task]) -> None:
     """A frame's results do not depend on its neighbours in the batch."""
     model = _model(kind)
     batch = _batch(model, training=False)
-    together = _results(model, batch)[kind.name]
+    task = _own(model, kind)
+    together = _results(model, batch)[task.name]
     for slot, part in enumerate(batch.split(1)):
-        for name, value in _results(model, part)[kind.name].items():
+        for name, value in _results(model, part)[task.name].items():
             if not _near(value[0], together[name][slot]):
                 raise ValueError(f"'{name}' of a frame differs in a batch of two")
 
@@ -146,7 +180,7 @@ def _near(a: Tensor, b: Tensor) -> bool:
 
 TASK_CHECKS: dict[str, Callable[[type[Task]], str | None]] = {
     "declared": lambda kind: _declared(kind),
-    "losses train it": _on_built_in(_losses),
-    "metrics have its columns": _on_built_in(_measures),
-    "frames alone and together": _on_built_in(_batched),
+    "losses train it": _on_data(_losses),
+    "metrics have its columns": _on_data(_measures),
+    "frames alone and together": _on_data(_batched),
 }
