@@ -11,7 +11,7 @@ from mtl_bench.core.backbone import TimmBackbone
 class DeepLabResNet50(TimmBackbone):
     timm_name = "resnet50"
     output_stride = 8
-    levels = (8,)
+    offered = (8,)
     divisor = 8
 
     def __init__(self, strides: tuple[int, ...] = (8,), pretrained: str | None = None):

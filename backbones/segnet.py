@@ -1,10 +1,10 @@
 """SegNet: an encoder and its mirror image, features at the image's own size; 24.9 M parameters.
 
-Badrinarayanan, Kendall, Cipolla, SegNet, TPAMI 2017, arXiv:1511.00561: VGG-16's convolutions, pooled
-by maxima whose places the decoder puts them back to. As the tables of multi-task papers have it
-(after MTAN, CVPR 2019), a stage of the decoder narrows in its first convolution, and images are not
-normalised. For recipes with `network.strides = [1]` and `network.decoder = "none"`; with three heads
-of 64 channels it has 25.06 M parameters. There are no pre-trained weights.
+Badrinarayanan, Kendall, Cipolla, SegNet, TPAMI 2017, arXiv:1511.00561: VGG-16's convolutions,
+pooled by maxima whose places the decoder puts them back to. As the tables of multi-task papers have
+it (after MTAN, CVPR 2019), a stage of the decoder narrows in its first convolution, and images are
+not normalised. For recipes with `network.strides = [1]` and `network.decoder = "none"`; with three
+heads of 64 channels it has 25.06 M parameters. There are no pre-trained weights.
 """
 
 from itertools import pairwise
@@ -28,7 +28,7 @@ def stage(inputs: int, outputs: int, convolutions: int) -> nn.Sequential:
 
 class SegNet(Backbone):
     mean, std = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-    levels = (1,)
+    offered = (1,)
     divisor = 2 ** len(WIDTHS)
 
     def __init__(self, strides: tuple[int, ...] = (1,), pretrained: str | None = None):
@@ -47,5 +47,5 @@ class SegNet(Backbone):
             x, place = F.max_pool2d(down(x), 2, return_indices=True)
             places.append(place)
         for up, place in zip(reversed(self.up), reversed(places), strict=True):
-            x = up(F.max_unpool2d(x, place, 2))
+            x = up(F.max_unpool2d(x, place, [2, 2]))
         return dict.fromkeys(self.channels, x)

@@ -32,7 +32,7 @@ class Backbone(nn.Module):
     )  # RGB in [0, 1], what it was trained with
     std: tuple[float, float, float] = (0.229, 0.224, 0.225)
     channels: dict[int, int]  # stride -> channels
-    levels: ClassVar[tuple[int, ...]] = (2, 4, 8, 16, 32)  # strides of the features that it can give
+    offered: ClassVar[tuple[int, ...]] = (2, 4, 8, 16, 32)  # strides of what it can give
     divisor: ClassVar[int] = 1  # of height and width, where that is more than the deepest stride
 
     def forward(self, image_B3HW: Tensor) -> dict[int, Tensor]:

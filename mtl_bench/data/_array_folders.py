@@ -2,11 +2,11 @@
 
     {train,val}/<folder>/N.npy      N from 0, height x width (x channels) of a frame
 
-Source: the archives of MTAN (Liu, Johns, Davison, CVPR 2019), which later papers train on. They have
-no validation split: a fifth of `train`, drawn with a fixed seed, is split "val" here (159 of NYUv2's
-795 frames, 595 of Cityscapes' 2975), and the folder `val`, which papers report, is split "test".
-`recipe.data.train_frames = "all"` trains on the whole folder, as those papers did; there is no split
-"val" then. Images are kept in 8 bits. Every file is checked as it is read.
+Source: the archives of MTAN (Liu, Johns, Davison, CVPR 2019), which later papers train on. They
+have no validation split: a fifth of `train`, drawn with a fixed seed, is split "val" here (159 of
+NYUv2's 795 frames, 595 of Cityscapes' 2975), and the folder `val`, which papers report, is split
+"test". `recipe.data.train_frames = "all"` trains on the whole folder, as those papers did; there is
+no split "val" then. Images are kept in 8 bits. Every file is checked as it is read.
 """
 
 from collections.abc import Collection, Mapping
@@ -185,11 +185,11 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     """RGB [H,W,3]."""
     image = load(path, 3)
     if image.dtype == np.uint8:
-        return image
+        return np.asarray(image, np.uint8)
     low, high = float(image.min()), float(image.max())
     if low < -1e-3 or high > 1 + 1e-3:
         raise ValueError(f"{path}: colours from {low:g} to {high:g}, not from 0 to 1")
-    return np.rint(image * 255).clip(0, 255).astype(np.uint8)
+    return np.asarray(np.rint(image * 255).clip(0, 255), np.uint8)
 
 
 def read_labels(path: Path, classes: int) -> NDArray[np.int32]:

@@ -1,9 +1,10 @@
 """Cityscapes as two-task papers train on it: 7 classes and inverse depth at 128 x 256.
 
-Source: Cordts et al., The Cityscapes Dataset, CVPR 2016, in the arrays of MTAN (Liu, Johns, Davison,
-CVPR 2019): `{train,val}/{image,label_7,label_19,depth}/N.npy`, 2975 and 500 frames; a folder `label`
-is `label_7` renamed, as other readers want it. "Depth" is the raw disparity / 65535, an inverse
-depth without metres: 0 means none. Label -1 means none.
+Source: Cordts et al., The Cityscapes Dataset, CVPR 2016, in the arrays of MTAN (Liu, Johns,
+Davison, CVPR 2019): `{train,val}/{image,label_7,label_19,depth}/N.npy`, 2975 and 500 frames; a
+folder `label` is `label_7` renamed, as other readers want it. "Depth" is the raw disparity / 65535,
+an inverse depth without metres: 0 means none. Label -1 means none. Which category each of the 7
+numbers is, is not documented: the order of Cityscapes' category ids is assumed, for names alone.
 """
 
 from collections.abc import Mapping

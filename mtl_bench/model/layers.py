@@ -163,8 +163,8 @@ class Finest(nn.Module):
 class DenseHead(TaskHead):
     """One decoder and one head: a raw map of some channels at the finest stride.
 
-    The recipe's `network.decoder` says which. With `aspp` the head is DeepLabV3's; with `none` it is
-    the two plain convolutions with which published tables divide a SegNet.
+    The recipe's `network.decoder` says which. With `aspp` the head is DeepLabV3's; with `none` it
+    is the two plain convolutions with which published tables divide a SegNet.
 
     Args:
         name: of the task; its map has it, too.

@@ -36,10 +36,8 @@ class Network(nn.Module):
         self.backbone = backbone
         self.strides = sizes.strides
         inputs: tuple[int, ...] = ()
-        self.context: nn.Module | None = None  # None where no decoder reads it
-        if backbone.vector:
-            self.context = nn.Identity()  # the vector is the context
-        else:
+        self.context: GlobalContext | None = None  # of a vector, that; else nothing reads it
+        if not backbone.vector:
             inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
             if sizes.decoder == MGNET:
                 self.context = GlobalContext(inputs[-1], sizes.channels)
@@ -86,11 +84,10 @@ class Network(nn.Module):
         which is empty where none reads it."""
         features = self.backbone(normalized_B3HW)
         if VECTOR in features:
-            return [], self.context(features[VECTOR][..., None, None])
+            return [], features[VECTOR][..., None, None]
         pyramid = [features[stride] for stride in self.strides]
-        return pyramid, pyramid[-1].new_empty(0) if self.context is None else self.context(
-            pyramid[-1]
-        )
+        deepest = pyramid[-1]
+        return pyramid, deepest.new_empty(0) if self.context is None else self.context(deepest)
 
     def raw(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> dict[str, Maps]:
         """Every task's raw maps [B,C,h,w]."""
@@ -106,7 +103,7 @@ class Network(nn.Module):
             # Views: a gradient with respect to the last level then leaves out its way through the
             # context module, which has a gradient of its own.
             *pyramid, context = (x.view_as(x) for x in (*pyramid, context))
-            outputs.representation = [*pyramid, *([context] if self.context is not None else [])]
+            outputs.representation = [*pyramid, *([context] if context.numel() else [])]
         raw = self.raw(pyramid, context)
         for task in self.tasks:
             maps = task.activate(raw[task.name])
@@ -216,11 +213,11 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
                 )
         given |= {"size": (data.height, data.width), "outputs": sizes.channels}
     else:
-        lacking = sorted(set(sizes.strides) - set(kind.levels))
+        lacking = sorted(set(sizes.strides) - set(kind.offered))
         if lacking:
             raise ValueError(
                 f"backbone '{cell.backbone}' has no features at stride {lacking[0]}: set "
-                f"network.strides to some of {', '.join(map(str, kind.levels))}"
+                f"network.strides to some of {', '.join(map(str, kind.offered))}"
             )
         given["strides"] = sizes.strides
     divisor = divisor_of(cell)

@@ -67,7 +67,7 @@ class DepthSupervised(Task):
         self.true, kind = field_of(recipe)
         self.inverse = kind is Kind.INVERSE_DEPTH
         # What the class declares is the same for every data set; what this one reads is its own.
-        self.needs = self.reads = self.truth = frozenset({self.true})  # type: ignore[misc]
+        self.needs = self.reads = self.truth = frozenset({self.true})
 
     def head(self, inputs: tuple[int, ...], sizes: Network) -> DenseHead:
         return DenseHead(self.name, inputs, sizes, 1)

@@ -2,8 +2,9 @@
 
 Source: Long, Shelhamer, Darrell, Fully Convolutional Networks, CVPR 2015: cross-entropy where there
 is a label; mean IoU and pixel accuracy of one confusion matrix over the whole set.
-Departure from the published tables: a class that the set lacks is left out of the mean, where their
-code divides 0 by 0. The labels are a data set's `instance_ids`, of which plain label ids are a case.
+Departure from the published tables: a class that the set lacks is left out of the mean, where
+their code divides 0 by 0. The labels are a data set's `instance_ids`, of which plain label ids are
+a case.
 """
 
 from collections.abc import Mapping, Sequence

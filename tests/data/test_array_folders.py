@@ -73,7 +73,7 @@ def test_validation_is_a_fifth_of_train_and_always_the_same(trees, kind):
     assert val.names == kind(root, "val", DATA).names
     everything = replace(DATA, train_frames="all")
     assert len(kind(root, "train", everything)) == TRAIN
-    with pytest.raises(ValueError, match="leaves no frame for validation"):
+    with pytest.raises(ValueError, match=r"leaves no frame for validation"):
         kind(root, "val", everything)
 
 
@@ -173,17 +173,17 @@ def test_a_broken_file_and_missing_ones(trees, tmp_path):
     root = shutil.copytree(trees[Nyuv2], tmp_path / "wrong")
     path = root / "val" / "image" / "0.npy"
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(ValueError, match="not a whole .npy array"):
+    with pytest.raises(ValueError, match=r"not a whole .npy array"):
         Nyuv2(root, "test", DATA).read("0")
     (root / "val" / "depth" / "2.npy").unlink()
-    with pytest.raises(ValueError, match="2.npy: missing, one of 1 frames without depth_m"):
+    with pytest.raises(ValueError, match=r"2.npy: missing, one of 1 frames without depth_m"):
         Nyuv2(root, "test", DATA, needs={"depth_m"})
     shutil.rmtree(root / "val" / "normal")
-    with pytest.raises(ValueError, match="no folder normal in it"):
+    with pytest.raises(ValueError, match=r"no folder normal in it"):
         Nyuv2(root, "test", DATA, needs={"normals"})
-    with pytest.raises(ValueError, match="no task can compare neighbours"):
+    with pytest.raises(ValueError, match=r"no task can compare neighbours"):
         Nyuv2(root, "test", DATA, needs={"neighbours"})
-    with pytest.raises(ValueError, match="must be published or all, not 'some'"):
+    with pytest.raises(ValueError, match=r"must be published or all, not 'some'"):
         Nyuv2(root, "train", replace(DATA, train_frames="some"))
 
 

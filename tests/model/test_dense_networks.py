@@ -54,17 +54,17 @@ def test_maps_have_the_size_of_the_input_and_every_parameter_trains(recipe, back
 
 
 def test_what_does_not_fit_together_is_one_line():
-    with pytest.raises(ValueError, match="backbone 'segnet' has no features at stride 4"):
+    with pytest.raises(ValueError, match=r"backbone 'segnet' has no features at stride 4"):
         model_of("dense-smoke", "segnet", strides=(4,))
-    with pytest.raises(ValueError, match="'mgnet' reads three levels, and network.strides has 1"):
+    with pytest.raises(ValueError, match=r"'mgnet' reads three levels, and network.strides has 1"):
         model_of("dense-smoke", "segnet", strides=(1,))
-    with pytest.raises(ValueError, match="decoder is not 'asp' .did you mean 'aspp'"):
+    with pytest.raises(ValueError, match=r"decoder is not 'asp' .did you mean 'aspp'"):
         model_of("dense-smoke", "tiny", decoder="asp")
-    with pytest.raises(ValueError, match="but task 'panoptic' has decoders of its own: set it to"):
+    with pytest.raises(ValueError, match=r"but task 'panoptic' has decoders of its own: set it to"):
         model_of("smoke", "tiny", decoder="aspp")
     recipe = load_recipe("nyuv2-segnet")
     cell = Cell(replace(recipe, data=replace(recipe.data, width=400)), "segnet", "fixed")
-    with pytest.raises(ValueError, match="288x400 is not divisible by the deepest stride 32"):
+    with pytest.raises(ValueError, match=r"288x400 is not divisible by the deepest stride 32"):
         build_model(cell, tasks_of_cell(cell))
 
 

@@ -1,4 +1,4 @@
-"""Classes, depth and normals: metrics against plain sums over all pixels, losses, trivial results."""
+"""Classes, depth and normals: metrics against plain sums over all pixels, losses, no values."""
 
 from dataclasses import replace
 
@@ -190,5 +190,5 @@ def test_depth_of_a_data_set_without_any_is_one_line():
     dataset = dataset_of(recipe)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "fields", {"instance_ids": dataset.fields["instance_ids"]})
-        with pytest.raises(ValueError, match="synthetic-nyuv2 has no depth: it has instance_ids"):
+        with pytest.raises(ValueError, match=r"synthetic-nyuv2 has no depth: it has instance_ids"):
             tasks_of(recipe, ["depth_supervised"], dataset.labels)

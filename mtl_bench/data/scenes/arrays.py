@@ -4,8 +4,8 @@
     {train,val}/{image,label_7,label_19,depth}/N.npy            Cityscapes
 
 `train` holds the training and the validation scenes, since those archives have no validation split,
-and `val` the test scenes. Images are float32 in [0, 1]. Depth is in metres up to 80; Cityscapes' is a
-disparity / 65535 as its camera of 2048 pixels would have it, in its steps. The sky and the ego
+and `val` the test scenes. Images are float32 in [0, 1]. Depth is in metres up to 80; Cityscapes' is
+a disparity / 65535 as its camera of 2048 pixels would have it, in its steps. The sky and the ego
 vehicle have neither depth nor normal (0), the ego vehicle no label (-1).
 """
 
@@ -60,7 +60,7 @@ def write_scene(root: Path, settings: Settings, split: int, number: int) -> dict
     scene = render.draw_scene((settings.seed, split, number), *settings.video)
     frame = settings.annotated
     seen = render.truth(scene, frame)
-    fields = {"image": render.image(scene, frame).astype(np.float32) / 255}
+    fields: dict[str, NDArray[Any]] = {"image": render.image(scene, frame).astype(np.float32) / 255}
     if settings.layout == NYUV2:
         fields["label"] = _TABLES["label"][seen.label_HW]
         near_HW = np.where(seen.depth_HW <= FARTHEST_M, seen.depth_HW, 0)
