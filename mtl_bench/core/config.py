@@ -40,6 +40,9 @@ GRANULARITIES = ("terms", "tasks")
 LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("data", "train_frames"),
     ("data", "test_scenes"),
+    ("network", "decoder"),
+    ("optim", "milestones"),
+    ("optim", "milestone_factor"),
     ("data", "heads"),
     ("data", "cosine"),
     ("data", "norm_ratio"),

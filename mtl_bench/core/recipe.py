@@ -49,8 +49,10 @@ class Augment:
 class Network:
     """Sizes of everything behind the backbone; the defaults are the paper's."""
 
-    strides: tuple[int, int, int] = (8, 16, 32)  # pyramid levels that the decoders read
-    channels: int = 128  # ARM, refinement and GCM; the vector of a backbone that gives one
+    strides: tuple[int, ...] = (8, 16, 32)  # pyramid levels that the decoders read
+    decoder: str = "mgnet"  # of three levels | aspp, of the deepest one | none: the finest as it is
+    # ARM, refinement and GCM; ASPP's branches; the vector of a backbone that gives one
+    channels: int = 128
     fused: int = 256  # FFM output
     head: int = 256  # hidden width of a head
     pose: str = "resnet18"  # pose encoder: resnet18 (the paper's) | light
@@ -86,7 +88,9 @@ class Optim:
     weight_decay: float = 0.0
     warmup_steps: int = 1000
     warmup_factor: float = 0.1
-    poly_power: float = 0.9
+    poly_power: float = 0.9  # 0: no decay
+    milestones: tuple[int, ...] = ()  # steps from which on learning rates are ...
+    milestone_factor: float = 0.5  # ... this much of what they were
     clip: float | None = 0.01  # total gradient norm
     precision: str = "fp32"  # fp32 | bf16 | fp16
     checkpoint_every: int = 1000  # steps

@@ -1,9 +1,10 @@
 """Regressions of one input whose losses differ ten-thousandfold: made, to part methods by scale.
 
 Source: after the toy problem of GradNorm (Chen et al., ICML 2018, section 4): number k is
-sigma_k times a function of its own and one that all share. Departures: the scales are spaced evenly
-on a logarithmic axis about 1, `norm_ratio` from end to end; the functions are sums of products, which no
-features but learned ones explain, and some noise; the input is an image of 8-bit noise.
+sigma_k times a function of its own and one that all share. Departures: the scales are spaced
+evenly on a logarithmic axis about 1, `norm_ratio` from end to end; the functions are sums of
+products, which no features but learned ones explain, and some noise; the input is an image of 8-bit
+noise.
 """
 
 from collections.abc import Collection, Mapping

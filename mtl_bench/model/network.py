@@ -13,10 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, plugins
-from mtl_bench.core.backbone import VECTOR, Backbone
+from mtl_bench.core.backbone import VECTOR, Backbone, divisor_of
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.task import Maps, Task, TaskHead
-from mtl_bench.model.layers import GlobalContext, Normalize, init_fan_in
+from mtl_bench.model.layers import MGNET, Decoder, GlobalContext, Normalize, init_fan_in
 
 
 @dataclass
@@ -35,21 +35,24 @@ class Network(nn.Module):
         self.normalize = Normalize(backbone.mean, backbone.std)
         self.backbone = backbone
         self.strides = sizes.strides
-        self.context: nn.Module
         inputs: tuple[int, ...] = ()
-        if backbone.vector:
-            self.context = nn.Identity()  # the vector is the context
-        else:
+        self.context: GlobalContext | None = None  # of a vector, that; else nothing reads it
+        if not backbone.vector:
             inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
-            assert len(inputs) == 3
-            self.context = GlobalContext(inputs[2], sizes.channels)
-        init_fan_in(self.context)
+            if sizes.decoder == MGNET:
+                self.context = GlobalContext(inputs[-1], sizes.channels)
+                init_fan_in(self.context)
         self.tasks = tuple(tasks)
         # All decoders come before all heads, under names of their own: so checkpoints have them.
         self.decoders, self.heads = nn.ModuleDict(), nn.ModuleDict()
         self._parts: dict[str, TaskHead] = {}
         for task in tasks:
             part = task.head(inputs, sizes)
+            if self.context is None and any(isinstance(m, Decoder) for m in part.modules()):
+                raise ValueError(
+                    f"network.decoder = '{sizes.decoder}', but task '{task.name}' has decoders of "
+                    f"its own: set it to '{MGNET}'"
+                )
             for own, ours in ((part.decoders, self.decoders), (part.heads, self.heads)):
                 taken = own.keys() & ours.keys()
                 if taken:
@@ -77,12 +80,14 @@ class Network(nn.Module):
             task.like_trained(self._parts[task.name], maps[task.name])
 
     def features(self, normalized_B3HW: Tensor) -> tuple[list[Tensor], Tensor]:
-        """What decoders read of a normalised image: the pyramid, finest first, and the context."""
+        """What decoders read of a normalised image: the pyramid, finest first, and the context,
+        which is empty where none reads it."""
         features = self.backbone(normalized_B3HW)
         if VECTOR in features:
-            return [], self.context(features[VECTOR][..., None, None])
+            return [], features[VECTOR][..., None, None]
         pyramid = [features[stride] for stride in self.strides]
-        return pyramid, self.context(pyramid[2])
+        deepest = pyramid[-1]
+        return pyramid, deepest.new_empty(0) if self.context is None else self.context(deepest)
 
     def raw(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> dict[str, Maps]:
         """Every task's raw maps [B,C,h,w]."""
@@ -98,7 +103,7 @@ class Network(nn.Module):
             # Views: a gradient with respect to the last level then leaves out its way through the
             # context module, which has a gradient of its own.
             *pyramid, context = (x.view_as(x) for x in (*pyramid, context))
-            outputs.representation = [*pyramid, context]
+            outputs.representation = [*pyramid, *([context] if context.numel() else [])]
         raw = self.raw(pyramid, context)
         for task in self.tasks:
             maps = task.activate(raw[task.name])
@@ -171,7 +176,8 @@ class Model(nn.Module):
         """Encoder and context module: what all tasks train."""
         assert isinstance(self.net, Network)
         yield from self.net.backbone.parameters()
-        yield from self.net.context.parameters()
+        if self.net.context is not None:
+            yield from self.net.context.parameters()
 
     def task_parameters(self) -> Iterator[nn.Parameter]:
         """Decoders, heads and further networks: each trained by one task only."""
@@ -206,13 +212,20 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
                     f"vector: choose another backbone"
                 )
         given |= {"size": (data.height, data.width), "outputs": sizes.channels}
-    elif data.height % sizes.strides[2] or data.width % sizes.strides[2]:
+    else:
+        lacking = sorted(set(sizes.strides) - set(kind.offered))
+        if lacking:
+            raise ValueError(
+                f"backbone '{cell.backbone}' has no features at stride {lacking[0]}: set "
+                f"network.strides to some of {', '.join(map(str, kind.offered))}"
+            )
+        given["strides"] = sizes.strides
+    divisor = divisor_of(cell)
+    if data.height % divisor or data.width % divisor:
         raise ValueError(
             f"input {data.height}x{data.width} is not divisible by the deepest stride "
-            f"{sizes.strides[2]}: change data.height, data.width or network.strides"
+            f"{divisor}: change data.height, data.width or network.strides"
         )
-    else:
-        given["strides"] = sizes.strides
     model = Model(Network(kind(**given), sizes, tasks), tasks)
     for task in tasks:
         model.add_extra(task, task.extra(sizes, cell.pretrained == "timm"))

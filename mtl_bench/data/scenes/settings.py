@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mtl_bench.data.scenes.render import RENDERER_VERSION
 
 CITYSCAPES, KITTI = "Cityscapes", "KITTI raw"  # layouts of files
+NYUV2, CITYSCAPES_ARRAYS = "NYUv2 arrays", "Cityscapes arrays"
 SPLITS = ("train", "val", "test")
 _FAST = [cv2.IMWRITE_PNG_COMPRESSION, 2]
 
