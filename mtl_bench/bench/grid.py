@@ -90,7 +90,15 @@ from mtl_bench.bench.jobs import (
     recipe_of,
 )
 from mtl_bench.core import plugins, toml_file
-from mtl_bench.core.config import Cell, Recipe, load_recipe, override, parse_settings, set_values
+from mtl_bench.core.config import (
+    Cell,
+    Latency,
+    Recipe,
+    load_recipe,
+    override,
+    parse_settings,
+    set_values,
+)
 from mtl_bench.core.plain import did_you_mean, from_dict, to_dict
 from mtl_bench.core.toml_file import Place, TomlFile
 from mtl_bench.deploy import engines
@@ -99,6 +107,7 @@ GRIDS = Path(__file__).parent / "grids"
 MOST = 10_000  # points of one grid: each takes a millisecond to look at, again and again
 MANY = 1000  # of which the number is said before
 TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
+SMOKE_STEPS = 6
 AXES = ("backbone", "size", "tasks", "engine", "precision")  # of timings
 Values: TypeAlias = Mapping[str, Any]
 FORMS: dict[type, str] = {
@@ -174,10 +183,10 @@ def load_grid(
     """A shipped grid by name, or a user's by the path of its TOML file.
 
     Args:
-        recipe: in place of the grid's.
+        recipe: in place of the grid's; where it has a backbone of its own, that, too.
         seeds: seeds 0 .. seeds - 1 in place of the grid's.
-        smoke: the file's `smoke_recipe` (without one: `smoke`) or its [smoke], under a name that
-            says so.
+        smoke: the file's `smoke_recipe` (without one: `smoke`) or its [smoke], or some steps of
+            `recipe`, under a name that says so.
         settings: `key=value` for every job; stands in place of an axis or of a row's value, and is
             what a row's "2x" multiplies.
         pretrained: as in `Cell`, for every cell.
@@ -360,14 +369,17 @@ def _of_cells(
             raise ValueError(f"{seeds} seeds: at least 1 is needed")
         axes["seed"] = tuple(range(seeds))
     _check_rows(file, axes)
+    key, otherwise = ("smoke_recipe", "smoke") if smoke else ("recipe", "small")
+    start = load_recipe(recipe or str(file.values.get(key, otherwise)))
+    start = _smoke_of(start) if smoke and recipe else start
+    if recipe and start.backbone:
+        settings = [f"backbone={start.backbone}", *settings]
     given = {setting.partition("=")[0].strip() for setting in settings}
     given |= {"recipe"} if smoke or recipe else set()
     axes = {axis: values for axis, values in axes.items() if axis not in given}
     for row in file.values.get("row", []) if "recipe" in given else ():
         row.pop("recipe", None)
-    key, otherwise = ("smoke_recipe", "smoke") if smoke else ("recipe", "small")
-    chosen = (not smoke and recipe) or str(file.values.get(key, otherwise))
-    points = _CellPoints(file, Cell(load_recipe(chosen), "", "", pretrained=pretrained), settings)
+    points = _CellPoints(file, Cell(start, "", "", pretrained=pretrained), settings)
     for index, rule in enumerate(file.values.get("skip", [])):
         for key, value in _values(rule).items():
             points.set(points.start, {key: value}, ("skip", index))
@@ -382,6 +394,12 @@ def _of_cells(
     )
     points.set(points.start, baseline, ("baseline", 0))
     return grid
+
+
+def _smoke_of(recipe: Recipe) -> Recipe:
+    """A recipe for as many steps as show that it runs."""
+    optim = replace(recipe.optim, steps=SMOKE_STEPS, warmup_steps=2)
+    return replace(recipe, smoke=True, optim=optim, latency=Latency(passes=5, warmup=1))
 
 
 def _check_rows(file: TomlFile, axes: Values) -> None:

@@ -48,7 +48,12 @@ def train(
     ] = None,
     recipe: Annotated[str, typer.Option(metavar="NAME|FILE", help="How to train.")] = "small",
     backbone: Annotated[
-        str | None, typer.Option(metavar="NAME", help="See `list`.", show_default=False)
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="See `list`; without it the recipe's, where it has one.",
+            show_default=False,
+        ),
     ] = None,
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="See `list`.", show_default=False)
@@ -116,13 +121,15 @@ def train(
 
         cell = load_cell(cell_file)
     else:
-        if backbone is None or method is None:
+        chosen = load_recipe(recipe)
+        backbone = backbone or chosen.backbone
+        if not backbone or method is None:
             raise ValueError("say which cell: --backbone NAME and --method NAME, or a cell.json")
         if tasks is not None and not o.names(tasks):
             raise ValueError("a cell needs a task: --tasks NAME,NAME")
         weights = o.weights(pretrained)
         cell = Cell(
-            load_recipe(recipe),
+            chosen,
             backbone,
             method,
             o.names(tasks),

@@ -1,9 +1,15 @@
-"""What a backbone is: an image in, a feature pyramid out, keyed by stride."""
+"""What a backbone is: an image in, a feature pyramid out, keyed by stride; or one vector."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import timm
 from torch import Tensor, nn
+
+from mtl_bench.core import plugins
+from mtl_bench.core.config import Cell
+
+VECTOR = 0  # stands for a stride where a backbone gives one vector
 
 
 class Backbone(nn.Module):
@@ -11,7 +17,13 @@ class Backbone(nn.Module):
 
     A subclass sets `channels` and implements `forward`. Its constructor takes `strides`, the
     pyramid levels that will be read (deeper ones need not be built), and `pretrained`.
+
+    One that gives a vector says `vector = True`. Its constructor takes `size`, the input's height
+    and width, and `outputs`, how many numbers the vector has, in place of `strides`; VECTOR is the
+    only key of `channels` and of what `forward` gives, [B, outputs].
     """
+
+    vector: ClassVar[bool] = False
 
     mean: tuple[float, float, float] = (
         0.485,
@@ -20,6 +32,8 @@ class Backbone(nn.Module):
     )  # RGB in [0, 1], what it was trained with
     std: tuple[float, float, float] = (0.229, 0.224, 0.225)
     channels: dict[int, int]  # stride -> channels
+    offered: ClassVar[tuple[int, ...]] = (2, 4, 8, 16, 32)  # strides of what it can give
+    divisor: ClassVar[int] = 1  # of height and width, where that is more than the deepest stride
 
     def forward(self, image_B3HW: Tensor) -> dict[int, Tensor]:
         """Normalised image -> {stride: features [B, channels[stride], H/stride, W/stride]}."""
@@ -36,6 +50,7 @@ class TimmBackbone(Backbone):
     """
 
     timm_name: str
+    output_stride: ClassVar[int] = 32  # 8 or 16: the stages behind it are dilated in place of that
 
     def __init__(self, strides: tuple[int, ...] = (8, 16, 32), pretrained: str | None = None):
         super().__init__()
@@ -46,13 +61,16 @@ class TimmBackbone(Backbone):
                     f"no weights file '{pretrained}'; --pretrained takes 'timm' or a file"
                 )
             overlay = {"file": str(pretrained)}
-        levels = tuple(range(max(strides).bit_length() - 1))  # stride 2 is level 0
+        dilated = {} if self.output_stride == 32 else {"output_stride": self.output_stride}
+        deepest = 32 if dilated and max(strides) == self.output_stride else max(strides)
+        levels = tuple(range(deepest.bit_length() - 1))  # stride 2 is level 0
         self.pyramid = timm.create_model(
             self.timm_name,
             pretrained=pretrained is not None,
             pretrained_cfg_overlay=overlay,
             features_only=True,
             out_indices=levels,
+            **dilated,
         )
         info = self.pyramid.feature_info
         reductions = dict(zip(info.reduction(), info.channels(), strict=True))
@@ -66,3 +84,9 @@ class TimmBackbone(Backbone):
         features = self.pyramid(image_B3HW)
         found = dict(zip(self._stride_of_level, features, strict=True))
         return {stride: found[stride] for stride in self.channels}
+
+
+def divisor_of(cell: Cell) -> int:
+    """What the height and width of a cell's images are multiples of."""
+    backbone = plugins.load("backbones", cell.backbone)
+    return 1 if backbone.vector else int(max(cell.recipe.network.strides[-1], backbone.divisor))

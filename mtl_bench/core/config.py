@@ -61,6 +61,12 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("data", "test_scenes"),
     ("data", "stride"),
     ("data", "min_flow"),
+    ("network", "decoder"),
+    ("optim", "milestones"),
+    ("optim", "milestone_factor"),
+    ("data", "heads"),
+    ("data", "cosine"),
+    ("data", "norm_ratio"),
     ("evaluate", "protocol"),
     ("evaluate", "also"),
     ("evaluate", "flip"),
@@ -183,7 +189,7 @@ def _args(kind: str, name: str, values: Mapping[str, Any], where: str) -> Mappin
 def canonical_json(cell: Cell) -> str:
     """What makes a cell itself: without names, prose and how often a checkpoint is written."""
     values = to_dict(cell)
-    for key in ("name", "about", "tasks"):
+    for key in ("name", "about", "tasks", "backbone"):
         del values["recipe"][key]
     for key in ("checkpoint_every", "cosine_every"):
         del values["recipe"]["optim"][key]
@@ -307,6 +313,12 @@ def check_cells(cells: Iterable[Cell]) -> None:
     seen: set[tuple[str, str, tuple[str, ...]]] = set()
     for cell in cells:
         declared = [plugins.attributes("tasks", task) for task in cell.tasks]
+        for task, facts in zip(cell.tasks, declared, strict=True):
+            stem, of_field = plugins.stem_and_field(task)[0], bool(facts.get("of_field"))
+            if of_field and task == stem:
+                raise ValueError(f"task '{task}' is of one field of the data set: {task}:FIELD")
+            if task != stem and not of_field:
+                raise ValueError(f"task '{stem}' is of no one field: '{stem}', not '{task}'")
         if cell.video and not any(found.get("makes_labels") for found in declared):
             raise ValueError(f"video needs a task that makes labels, not {', '.join(cell.tasks)}")
         for kind, name, values in _chosen(cell):

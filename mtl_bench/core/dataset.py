@@ -34,6 +34,7 @@ class Kind(Enum):
     INVERSE_DEPTH = "inverse depth or disparity [H,W]"  # nearest pixel; a zoom multiplies it
     NORMALS = "unit normals [3,H,W], x right, y down, z forward"  # nearest pixel; a flip negates x
     MASK = "true or false [H,W]"  # nearest pixel; false on padding
+    PICTURE = "grey levels [H,W]"  # nearest pixel; 0 on padding
     VECTOR = "numbers of the whole image"  # nothing changes them
 
 
@@ -128,6 +129,9 @@ class Dataset:
     marks: ClassVar[str] = ""  # what a folder of it has, such as "leftImg8bit/"
     built_in: ClassVar[bool] = False  # rendered on first use; others need --data
     published: ClassVar[Mapping[str, int]] = {}  # frames of each split, as papers report it
+    has_camera: ClassVar[bool] = True  # whether frames have intrinsics
+    # Tasks that are of one field: which of its fields they can be of
+    predicts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     names: list[str]
     # Which members make no numbers of a cell, or those of its pseudo labels alone
     stage_members: ClassVar[dict[str, tuple[str, ...]]] = {
@@ -138,6 +142,7 @@ class Dataset:
             "marks",
             "built_in",
             "published",
+            "predicts",
             "takes_further_labels",
             "recognises",
             "render",

@@ -6,7 +6,8 @@ what `--plugins` names: a folder with such folders in it, a folder of plug-ins o
 file. A file reached twice counts once; a package's file is its `__init__.py`. `_name.py` is a
 helper that its neighbours import with `from ._name import ...`.
 
-Finding and describing read the files as text; only `load` runs one.
+Finding and describing read the files as text; only `load` runs one. A task that is of one field of
+the data set is named with that: `regress:y0` is `regress.py`'s task on the field y0.
 """
 
 import ast
@@ -46,7 +47,9 @@ SHIPPED = {  # in the package; the others have a folder of their own beside it
     "datasets": PACKAGE / "data",
     "engines": PACKAGE / "deploy" / "engines",
 }
-GIVEN = ("self", "terms", "seed", "strides", "pretrained")  # the harness fills these arguments in
+GIVEN = (  # the harness fills these arguments in
+    *("self", "terms", "seed", "strides", "size", "outputs", "pretrained"),
+)
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders are called by it
 NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
 IS_NAME = Rule(
@@ -106,6 +109,7 @@ def path_of(kind: str, name: str) -> Path:
     Raises:
         ValueError: an unknown name, one that two files have, or what is no name.
     """
+    name = stem_and_field(name)[0]
     word, paths = kind[:-1], _candidates(kind).get(name)
     if paths is None:
         raise ValueError(
@@ -133,6 +137,12 @@ def _candidates(kind: str) -> dict[str, list[Path]]:
         if _kind_of(path) == kind:
             found.setdefault(name_of(path), []).append(path)
     return dict(sorted(found.items()))
+
+
+def stem_and_field(task: str) -> tuple[str, str]:
+    """A task's file and the field that it is of: `regress:y0` -> regress, y0; without one ""."""
+    stem, _, field = task.partition(":")
+    return stem, field
 
 
 def _files_in(folder: Path) -> list[Path]:
@@ -350,7 +360,7 @@ def load(kind: str, name: str) -> type[Any]:
         ValueError: unknown or ambiguous name, a file that fails to import (with its line), or one
             that does not define exactly one subclass of `Method` (`Backbone`, `Engine`).
     """
-    path = path_of(kind, name)
+    path, name = path_of(kind, name), stem_and_field(name)[0]
     base_module, base_name = BASES[kind]
     base = getattr(importlib.import_module(base_module), base_name)
     if path.is_relative_to(PACKAGE) and kind in SHIPPED:

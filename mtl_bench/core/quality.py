@@ -6,12 +6,13 @@ It is read from the tasks' files as text, so that a list of results need not wai
 import ast
 import functools
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
 from mtl_bench.core import plugins
 from mtl_bench.core.columns import Column
+from mtl_bench.core.recipe import Recipe
 
 VALUES = ast.Call | ast.Name | ast.Starred | ast.Tuple | ast.Dict | ast.keyword | ast.Constant
 SIGNS = ast.UnaryOp | ast.UAdd | ast.USub | ast.Load
@@ -23,9 +24,14 @@ def declared(name: str) -> dict[str, Any]:
 
     Tasks that assign nothing are absent.
     """
-    tasks = plugins.ordered(plugins.readable("tasks"))
-    found = {task: _read(task, plugins.path_of("tasks", task).read_bytes(), name) for task in tasks}
+    paths = {task: plugins.path_of("tasks", task) for task in _tasks()}
+    found = {task: _read(task, path.read_bytes(), name) for task, path in paths.items()}
     return {task: value for task, value in found.items() if value is not None}
+
+
+def _tasks() -> list[str]:
+    """Those that are found, the default recipe's first: one more changes no report without it."""
+    return sorted(plugins.ordered(plugins.readable("tasks")), key=lambda t: t not in Recipe.tasks)
 
 
 @functools.cache
@@ -56,9 +62,11 @@ def agreement() -> tuple[Column, ...]:
     return tuple(in_turns([c for c in columns if c.task == task] for task in tasks))
 
 
-def words(key: str) -> list[str]:
-    """What the tasks' `words` say under a key."""
-    return [said[key] for said in declared("words").values() if key in said]
+def words(key: str, tasks: Collection[str]) -> list[str]:
+    """What these tasks' `words` say under a key."""
+    stems = {plugins.stem_and_field(task)[0] for task in tasks}
+    found = declared("words").items()
+    return [said[key] for task, said in found if key in said and task in stems]
 
 
 def in_turns(several: Iterable[Sequence[T]]) -> list[T]:
@@ -68,16 +76,35 @@ def in_turns(several: Iterable[Sequence[T]]) -> list[T]:
 
 
 def columns_of(task: str, name: str = "columns") -> list[Column]:
-    """A task's columns; an heir's come after those of the task that it derives from."""
+    """A task's columns; an heir's come after those of the task that it derives from.
+
+    One that is of a field has them once for each field that a data set has for it.
+    """
     text = plugins.path_of("tasks", task).read_bytes()
     inherited = [c for base in plugins.bases("tasks", text) for c in columns_of(base, name)]
-    return [*inherited, *(replace(c, task=task) for c in _read(task, text, name) or ())]
+    own = [*inherited, *(replace(c, task=task) for c in _read(task, text, name) or ())]
+    if not plugins.attributes("tasks", task).get("of_field"):
+        return own
+    datasets = [plugins.attributes("datasets", name) for name in plugins.readable("datasets")]
+    several = [facts.get("predicts", {}).get(task, ()) for facts in datasets]
+    fields = dict.fromkeys(itertools.chain.from_iterable(several))
+    return [_of_field(column, field) for field in fields for column in own]
+
+
+def _of_field(column: Column, field: str) -> Column:
+    """`regress.rmse` of the field y0 is `regress.y0.rmse`."""
+    return replace(
+        column,
+        name=f"{field}_{column.name}",
+        key=column.key.replace(".", f".{field}.", 1),
+        title=f"{field.replace('_', ' ')} {column.title}",
+        task=f"{column.task}:{field}",
+    )
 
 
 def _columns(name: str) -> list[Column]:
     """Of every task that is found; an heir's own alone, as its task's are there."""
-    tasks = plugins.ordered(plugins.readable("tasks"))
-    found = {c.name: c for task in tasks for c in columns_of(task, name)}
+    found = {c.name: c for task in _tasks() for c in columns_of(task, name)}
     return list(found.values())
 
 

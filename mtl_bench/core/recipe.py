@@ -54,6 +54,13 @@ class Data(Checked):
     min_flow: Annotated[
         NotNegative, "pixels; training frames that move less against neighbours are left out"
     ] = 0.0
+    heads: Annotated[Count, "made regressions only: how many"] = 10
+    cosine: Annotated[
+        float, least(-1), most(1), "made regressions only: of any two of their functions"
+    ] = 0.0
+    norm_ratio: Annotated[
+        Positive, "made regressions only: of the last one's scale to the first one's"
+    ] = 10.0
     cache: Annotated[bool, "keep decoded frames in memory"] = True
     workers: Annotated[Whole, "processes that load data; 0: the training process does"] = 0
 
@@ -72,15 +79,28 @@ class Augment(Checked):
     saturation: Annotated[Share, "as brightness"] = 0.2
     hue: Annotated[float, least(0), most(0.5), "turns of the colour circle, from +- this"] = 0.05
 
+    @property
+    def nothing(self) -> bool:
+        """Whether every sample is its frame, unchanged."""
+        widths = (self.brightness, self.contrast, self.saturation, self.hue)
+        return not (self.flip or self.crop or any(widths)) and self.scales == (1.0,)
+
 
 @dataclass(frozen=True)
 class Network(Checked):
     """Sizes of everything behind the backbone; the defaults are the paper's."""
 
     strides: Annotated[
-        tuple[Count, Count, Count], ASCENDING, "pyramid levels that the decoders read"
+        tuple[Count, ...], SOME, ASCENDING, "pyramid levels that the decoders read"
     ] = (8, 16, 32)
-    channels: Annotated[Count, "of ARM, refinement and GCM"] = 128
+    decoder: Annotated[
+        str,
+        one_of("mgnet", "aspp", "none"),
+        "mgnet, of three levels; aspp, of the deepest one; none: the finest as it is",
+    ] = "mgnet"
+    channels: Annotated[
+        Count, "of ARM, refinement and GCM; of ASPP's branches; of a backbone's one vector"
+    ] = 128
     fused: Annotated[Count, "channels behind the FFM"] = 256
     head: Annotated[Count, "hidden channels of a head"] = 256
     pose: Annotated[str, "pose encoder: resnet18 (the paper's) or light"] = "resnet18"
@@ -125,7 +145,13 @@ class Optim(Checked):
     weight_decay: Annotated[NotNegative, "of all but a method's own parameters"] = 0.0
     warmup_steps: Annotated[Whole, "over which the rate rises"] = 1000
     warmup_factor: Annotated[Share, "of the rate at the first step"] = 0.1
-    poly_power: Annotated[NotNegative, "of the decay (1 - step / steps)^power"] = 0.9
+    poly_power: Annotated[NotNegative, "of the decay (1 - step / steps)^power; 0: none"] = 0.9
+    milestones: Annotated[
+        tuple[Count, ...],
+        ASCENDING,
+        "steps from which on rates are times milestone_factor",
+    ] = ()
+    milestone_factor: Annotated[Share, "see milestones"] = 0.5
     clip: Annotated[Positive | None, "total gradient norm"] = 0.01
     precision: Annotated[str, one_of("fp32", "bf16", "fp16"), "of training"] = "fp32"
     checkpoint_every: Annotated[Count, "steps; no part of a cell's id"] = 1000
@@ -208,6 +234,7 @@ class Recipe(Checked):
     smoke: Annotated[bool, "marks rows that must never be read as results"] = False
     # Of a cell that names none
     tasks: Annotated[tuple[str, ...], SOME, DISTINCT] = ("panoptic", "depth")
+    backbone: str = ""  # and of a grid that is run with --recipe
     data: Data = field(default_factory=Data)
     augment: Augment = field(default_factory=Augment)
     network: Network = field(default_factory=Network)

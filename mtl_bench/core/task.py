@@ -8,7 +8,7 @@ Shapes: B images, H x W input pixels, h x w cells of the finest feature map.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,7 +27,7 @@ from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.terms import Term
 from mtl_bench.core.view import View
 
-Maps = dict[str, Tensor]  # by name, [B,C,H,W]
+Maps = dict[str, Tensor]  # by name, [B,C,H,W]; of a number of the whole image [B,C]
 Results = dict[str, Tensor]  # by name, the first axis is B
 Size = tuple[int, int]  # height, width
 Frame = Mapping[str, Any]  # one frame's arrays, by name
@@ -126,14 +126,16 @@ class Task:
     Args:
         recipe: sizes, switches of losses, settings of the post-processing.
         labels: the data set's classes.
+        field: of the data set, where `of_field`: what it predicts, needs and is compared with.
     """
 
-    name: ClassVar[str] = ""  # the file's stem
-    terms: ClassVar[tuple[Term, ...]]
+    name: str = ""  # the file's stem; with its field `stem:field`
+    terms: tuple[Term, ...]  # one that is of a field has one, which gets its name
+    of_field: ClassVar[bool] = False  # whether a cell says of which field of the data set it is
     kind: ClassVar[str] = "regression"  # the likelihood behind most of the sum of its terms
-    needs: ClassVar[frozenset[str]] = frozenset()  # fields of a training sample, beside the image
-    reads: ClassVar[frozenset[str]] = frozenset()  # those of them that `losses` itself reads
-    truth: ClassVar[frozenset[str]] = frozenset()  # fields of an evaluation sample
+    needs: frozenset[str] = frozenset()  # fields of a training sample, beside the image
+    reads: frozenset[str] = frozenset()  # those of them that `losses` itself reads
+    truth: frozenset[str] = frozenset()  # fields of an evaluation sample
     after: ClassVar[tuple[str, ...]] = ()  # tasks whose results `finish` may read
     columns: ClassVar[tuple[Column, ...]] = ()  # of its metrics
     maps: ClassVar[Mapping[str, MapInfo]] = {}  # that `finish` reads, by the head's names
@@ -143,6 +145,7 @@ class Task:
     meaning: ClassVar[Mapping[str, str]] = {}
     has_points: ClassVar[bool] = False  # whether `points` gives any
     reads_camera: ClassVar[bool] = False  # whether `finish` or `points` does
+    reads_pyramid: ClassVar[bool] = True  # else its head reads the context, one vector, alone
     makes_labels: ClassVar[bool] = False  # whether the video stage's labels come from it
     averages_flip: ClassVar[bool] = False  # whether `flip_averaged` does anything
     # The kinds of files that `predict` can write of a frame, the picture first; "points" is the
@@ -163,6 +166,7 @@ class Task:
         "train": (
             "terms",
             "kind",
+            "reads_pyramid",
             "needs",
             "reads",
             "head",
@@ -212,8 +216,12 @@ class Task:
         ),
     }
 
-    def __init__(self, recipe: Recipe, labels: LabelSet) -> None:
-        self.recipe, self.labels = recipe, labels
+    def __init__(self, recipe: Recipe, labels: LabelSet, field: str = "") -> None:
+        self.recipe, self.labels, self.field = recipe, labels, field
+        if field:
+            self.name = f"{self.name}:{field}"
+            self.needs = self.reads = self.truth = frozenset({field})
+            self.terms = tuple(replace(term, name=self.name, task=self.name) for term in self.terms)
 
     # --- network ----------------------------------------------------------------------------------
 
@@ -221,7 +229,8 @@ class Task:
         """Decoders and heads.
 
         Args:
-            inputs: channels of the features, finest first.
+            inputs: channels of the features, finest first; none where a backbone gives a vector.
+            sizes: `channels` is the context's width.
         """
         raise NotImplementedError
 
@@ -260,6 +269,8 @@ class Task:
         """Maps at another size: bilinear, corners not aligned."""
         return {
             name: F.interpolate(map_.float(), size, mode="bilinear", align_corners=False)
+            if map_.dim() == 4
+            else map_
             for name, map_ in maps.items()
         }
 
@@ -372,7 +383,10 @@ def tasks_of(recipe: Recipe, names: Iterable[str], labels: LabelSet) -> tuple[Ta
     Raises:
         ValueError: an unknown task.
     """
-    return tuple(plugins.load("tasks", n)(recipe, labels) for n in plugins.ordered(names))
+    return tuple(
+        plugins.load("tasks", name)(recipe, labels, plugins.stem_and_field(name)[1])
+        for name in plugins.ordered(names)
+    )
 
 
 def tasks_of_cell(cell: Cell) -> tuple[Task, ...]:

@@ -4,6 +4,7 @@ Which samples a step gets follows from (seed, epoch), what happens to them from 
 A run that starts at any step, in one process or several, therefore sees the same batches.
 """
 
+import dataclasses
 import hashlib
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
@@ -53,7 +54,7 @@ def train_batches(
         )
     steps = _Steps(len(samples), batch_size, seed, start_step)
     if workers == 0:
-        return (collate(list(_drawn(samples, slots))) for slots in steps)
+        return (_batch(samples, slots) for slots in steps)
     return _from_workers(samples.uncached(), steps, workers, pinned)
 
 
@@ -78,6 +79,17 @@ def _sizes(sample: Batch) -> dict[str, torch.Size]:
 
 
 Slot = tuple[int, int]  # index of a sample, seed of its augmentation
+
+
+def _batch(samples: Samples, slots: list[Slot]) -> Batch:
+    """One step's samples; taken out of a tensor of all where they are the same every time."""
+    whole = samples.whole
+    if whole is None:
+        return collate(list(_drawn(samples, slots)))
+    indices = [index for index, _ in slots]
+    chosen = torch.tensor(indices)
+    names = [whole.names[index] for index in indices]
+    return dataclasses.replace(whole.map(lambda value: value[chosen]), names=names)
 
 
 def _drawn(samples: Samples, slots: list[Slot]) -> Iterator[Batch]:

@@ -5,6 +5,7 @@ what tasks make of its fields; in evaluation it is the plain frame with the trut
 """
 
 import copy
+import functools
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Self
@@ -12,7 +13,7 @@ from typing import Self
 import torch
 from torch import Generator, Tensor
 
-from mtl_bench.core.batch import Batch, Camera
+from mtl_bench.core.batch import Batch, Camera, collate
 from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, dataset_of
 from mtl_bench.core.labels import OUTSIDE
 from mtl_bench.core.recipe import Augment, Recipe
@@ -38,13 +39,17 @@ def open_samples(
         truth: which of the data set's truths to evaluate on.
 
     Raises:
-        ValueError: an unknown data set, or a folder that lacks what the tasks need.
+        ValueError: an unknown data set, one that lacks what the tasks need, or such a folder.
     """
+    kind = dataset_of(recipe)
+    for task in tasks:
+        if task.reads_camera and not kind.has_camera:
+            raise ValueError(
+                f"task '{task.name}' reads the camera, and {recipe.data.dataset} has none"
+            )
     needs = frozenset().union(*(task.needs if training else task.truth for task in tasks))
     more = {} if further_labels is None else {"further_labels": further_labels}
-    dataset = dataset_of(recipe)(
-        root, split, recipe.data, needs=needs, training=training, truth=truth, **more
-    )
+    dataset = kind(root, split, recipe.data, needs=needs, training=training, truth=truth, **more)
     targets = [task.targets for task in tasks]
     keep = frozenset().union(*(task.reads for task in tasks))
     return Samples(dataset, recipe.augment if training else None, targets, keep)
@@ -96,10 +101,32 @@ class Samples:
             frame = self.dataset.read(name)
             if self._kept is not None:
                 self._kept[index] = frame
-        if generator is not None:
-            return self._augmented(name, frame, generator)
+        if generator is not None and not self.fixed:
+            return self._training(self._augmented(name, frame, generator))
         image = frame.images_N3HW[0].contiguous().float() / 255
-        return Batch([name], image, _camera(frame, frame.K_33), dict(frame.fields))
+        sample = Batch([name], image, _camera(frame, frame.K_33), dict(frame.fields))
+        return sample if generator is None else self._training(sample)
+
+    @property
+    def fixed(self) -> bool:
+        """Whether nothing is random about a training sample."""
+        assert self._augment is not None
+        return self._augment.nothing and NEIGHBOURS not in self.dataset.needs
+
+    @functools.cached_property
+    def whole(self) -> Batch | None:
+        """All training samples at once, where they are fixed and may stay in memory."""
+        if self._kept is None or not self.fixed:
+            return None
+        return collate([self.sample(index, Generator()) for index in range(len(self))])
+
+    def _training(self, sample: Batch) -> Batch:
+        """With what tasks make of its fields, and without those that they do not read."""
+        for make in self._targets:
+            sample.fields |= make(sample)
+        for name in self.dataset.fields.keys() - self._keep:
+            sample.fields.pop(name, None)
+        return sample
 
     def _augmented(self, name: str, frame: DecodedFrame, generator: Generator) -> Batch:
         assert self._augment is not None
@@ -120,16 +147,12 @@ class Samples:
                 "clean_neighbours": view.clean_N3HW[1:],
                 "reprojection_mask": ~torch.isin(view.static_HW, unmoved),
             }
-        for make in self._targets:
-            sample.fields |= make(sample)
-        for name in self.dataset.fields.keys() - self._keep:
-            sample.fields.pop(name, None)
         return sample
 
 
 def _camera(frame: DecodedFrame, K_33: Tensor | None) -> Camera:
-    """NaN intrinsics where the frame has none: nobody takes them for a camera's."""
+    """NaN throughout where the data set has none: what no task reads needs no value."""
     if K_33 is None:
-        K_33 = torch.full((3, 3), torch.nan)
+        return Camera(torch.full((3, 3), torch.nan), *torch.full((2,), torch.nan))
     height, pitch = frame.camera_height_m, frame.camera_pitch_rad
     return Camera(K_33, torch.tensor(height), torch.tensor(pitch))

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, geometry
+from mtl_bench.core.backbone import divisor_of
 from mtl_bench.core.batch import Batch, Camera, collate
 from mtl_bench.core.config import Cell, Recipe, load_recipe
 from mtl_bench.core.device import initial_weights
@@ -118,7 +119,7 @@ def check_size(cell: Cell, size: tuple[int, int]) -> None:
     """Raises:
     ValueError: a size that the network's deepest stride does not divide.
     """
-    deepest = cell.recipe.network.strides[2]
+    deepest = divisor_of(cell)
     if size[0] % deepest or size[1] % deepest:
         raise ValueError(f"--size {size[0]}x{size[1]}: the network needs multiples of {deepest}")
 

@@ -291,7 +291,7 @@ def _protocol(
 
 
 def true_size(batch: Batch) -> Size:
-    """Of the truth, height and width.
+    """Of the truth, height and width; of one that has none, such as a class, the image's.
 
     Raises:
         ValueError: there is none.
@@ -299,6 +299,8 @@ def true_size(batch: Batch) -> Size:
     for truth in batch.fields.values():
         if truth.dim() >= 3:
             return int(truth.shape[-2]), int(truth.shape[-1])
+    if batch.fields:
+        return int(batch.image_B3HW.shape[-2]), int(batch.image_B3HW.shape[-1])
     raise ValueError(f"no ground truth for {batch.names[0]}: choose a split that has it")
 
 

@@ -12,9 +12,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mtl_bench.core.plain import did_you_mean
 from mtl_bench.core.recipe import Network
 from mtl_bench.core.task import Maps, TaskHead
 
+MGNET, ASPP, NONE = "mgnet", "aspp", "none"  # decoders of a recipe
 LEAK = 0.01  # LeakyReLU slope of the paper's InPlaceABN
 
 
@@ -86,6 +88,11 @@ class Decoder(nn.Module):
 
     def __init__(self, inputs: tuple[int, ...], channels: int, fused: int):
         super().__init__()
+        if len(inputs) != 3:
+            raise ValueError(
+                f"network.decoder = '{MGNET}' reads three levels, and network.strides has "
+                f"{len(inputs)}: name three, or choose another decoder"
+            )
         skip, middle, deep = inputs
         self.arm_deep = AttentionRefinement(deep, channels)
         self.arm_middle = AttentionRefinement(middle, channels)
@@ -110,8 +117,54 @@ class Head(nn.Sequential):
         super().__init__(ConvNorm(inputs, hidden, 3), nn.Conv2d(hidden, outputs, 1, bias=False))
 
 
+def _conv_relu(inputs: int, outputs: int, kernel: int, dilation: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, kernel, 1, kernel // 2 * dilation, dilation, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
+
+
+class AtrousPyramid(nn.Module):
+    """ASPP: convolutions of several reaches over the deepest level, beside its global mean.
+
+    Source: Chen et al., Rethinking Atrous Convolution, 2017 (DeepLabV3): rates for stride 8, and
+    the dropout of its common implementations.
+
+    Args:
+        inputs: channels of the level.
+        outputs: of every branch, and of the result.
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, rates: Sequence[int] = (12, 24, 36), dropout: float = 0.5
+    ):
+        super().__init__()
+        wide = (_conv_relu(inputs, outputs, 3, rate) for rate in rates)
+        self.branches = nn.ModuleList([_conv_relu(inputs, outputs, 1), *wide])
+        self.image = _conv_relu(inputs, outputs, 1)
+        self.project = _conv_relu((len(rates) + 2) * outputs, outputs, 1)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> list[Tensor]:
+        deep = pyramid[-1]
+        image = self.image(deep.mean((2, 3), keepdim=True)).expand(-1, -1, *deep.shape[2:])
+        found = torch.cat([*(branch(deep) for branch in self.branches), image], 1)
+        return [self.dropout(self.project(found))]
+
+
+class Finest(nn.Module):
+    """No decoder: the finest level, of a backbone that has one of its own."""
+
+    def forward(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> list[Tensor]:
+        return [pyramid[0]]
+
+
 class DenseHead(TaskHead):
     """One decoder and one head: a raw map of some channels at the finest stride.
+
+    The recipe's `network.decoder` says which. With `aspp` the head is DeepLabV3's; with `none` it
+    is the two plain convolutions with which published tables divide a SegNet.
 
     Args:
         name: of the task; its map has it, too.
@@ -122,14 +175,50 @@ class DenseHead(TaskHead):
     def __init__(self, name: str, inputs: tuple[int, ...], sizes: Network, outputs: int):
         super().__init__()
         self.name = name
-        self.decoders = nn.ModuleDict({name: Decoder(inputs, sizes.channels, sizes.fused)})
-        self.heads = nn.ModuleDict({name: Head(sizes.fused, sizes.head, outputs)})
+        decoder: nn.Module
+        head: nn.Module
+        if sizes.decoder == MGNET:
+            decoder = Decoder(inputs, sizes.channels, sizes.fused)
+            head = Head(sizes.fused, sizes.head, outputs)
+        elif sizes.decoder == ASPP:
+            decoder = AtrousPyramid(inputs[-1], sizes.channels)
+            last = nn.Conv2d(sizes.head, outputs, 1)
+            head = nn.Sequential(_conv_relu(sizes.channels, sizes.head, 3), last)
+        elif sizes.decoder == NONE:
+            decoder = Finest()
+            first = nn.Conv2d(inputs[0], sizes.head, 3, padding=1)
+            head = nn.Sequential(first, nn.Conv2d(sizes.head, outputs, 1))
+        else:
+            known = did_you_mean(sizes.decoder, (MGNET, ASPP, NONE))
+            raise ValueError(f"recipe.network.decoder is not '{sizes.decoder}'{known}")
+        self.decoders, self.heads = nn.ModuleDict({name: decoder}), nn.ModuleDict({name: head})
 
     def forward(
         self, pyramid: Sequence[Tensor], context_BC11: Tensor, auxiliary: bool = False
     ) -> Maps:
         features_BChw = self.decoders[self.name](pyramid, context_BC11)[0]
         return {self.name: self.heads[self.name](features_BChw)}
+
+
+class VectorHead(TaskHead):
+    """A linear layer on the context: numbers of the whole image.
+
+    Args:
+        name: of the task.
+        map_: what its numbers are called.
+        outputs: how many they are.
+    """
+
+    def __init__(self, name: str, map_: str, sizes: Network, outputs: int):
+        super().__init__()
+        self.name, self.map = name, map_
+        self.decoders = nn.ModuleDict()
+        self.heads = nn.ModuleDict({name: nn.Linear(sizes.channels, outputs)})
+
+    def forward(
+        self, pyramid: Sequence[Tensor], context_BC11: Tensor, auxiliary: bool = False
+    ) -> Maps:
+        return {self.map: self.heads[self.name](context_BC11.flatten(1))}
 
 
 def init_fan_in(module: nn.Module) -> None:

@@ -13,10 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, plugins
-from mtl_bench.core.backbone import Backbone
+from mtl_bench.core.backbone import VECTOR, Backbone, divisor_of
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.task import Maps, Task, TaskHead
-from mtl_bench.model.layers import GlobalContext, Normalize, init_fan_in
+from mtl_bench.model.layers import MGNET, Decoder, GlobalContext, Normalize, init_fan_in
 
 
 @dataclass
@@ -35,16 +35,24 @@ class Network(nn.Module):
         self.normalize = Normalize(backbone.mean, backbone.std)
         self.backbone = backbone
         self.strides = sizes.strides
-        inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
-        assert len(inputs) == 3
-        self.context = GlobalContext(inputs[2], sizes.channels)
-        init_fan_in(self.context)
+        inputs: tuple[int, ...] = ()
+        self.context: GlobalContext | None = None  # of a vector, that; else nothing reads it
+        if not backbone.vector:
+            inputs = tuple(backbone.channels[stride] for stride in sizes.strides)
+            if sizes.decoder == MGNET:
+                self.context = GlobalContext(inputs[-1], sizes.channels)
+                init_fan_in(self.context)
         self.tasks = tuple(tasks)
         # All decoders come before all heads, under names of their own: so checkpoints have them.
         self.decoders, self.heads = nn.ModuleDict(), nn.ModuleDict()
         self._parts: dict[str, TaskHead] = {}
         for task in tasks:
             part = task.head(inputs, sizes)
+            if self.context is None and any(isinstance(m, Decoder) for m in part.modules()):
+                raise ValueError(
+                    f"network.decoder = '{sizes.decoder}', but task '{task.name}' has decoders of "
+                    f"its own: set it to '{MGNET}'"
+                )
             for own, ours in ((part.decoders, self.decoders), (part.heads, self.heads)):
                 taken = own.keys() & ours.keys()
                 if taken:
@@ -72,10 +80,14 @@ class Network(nn.Module):
             task.like_trained(self._parts[task.name], maps[task.name])
 
     def features(self, normalized_B3HW: Tensor) -> tuple[list[Tensor], Tensor]:
-        """What decoders read of a normalised image: the pyramid, finest first, and the context."""
+        """What decoders read of a normalised image: the pyramid, finest first, and the context,
+        which is empty where none reads it."""
         features = self.backbone(normalized_B3HW)
+        if VECTOR in features:
+            return [], features[VECTOR][..., None, None]
         pyramid = [features[stride] for stride in self.strides]
-        return pyramid, self.context(pyramid[2])
+        deepest = pyramid[-1]
+        return pyramid, deepest.new_empty(0) if self.context is None else self.context(deepest)
 
     def raw(self, pyramid: Sequence[Tensor], context_BC11: Tensor) -> dict[str, Maps]:
         """Every task's raw maps [B,C,h,w]."""
@@ -91,7 +103,7 @@ class Network(nn.Module):
             # Views: a gradient with respect to the last level then leaves out its way through the
             # context module, which has a gradient of its own.
             *pyramid, context = (x.view_as(x) for x in (*pyramid, context))
-            outputs.representation = [*pyramid, context]
+            outputs.representation = [*pyramid, *([context] if context.numel() else [])]
         raw = self.raw(pyramid, context)
         for task in self.tasks:
             maps = task.activate(raw[task.name])
@@ -164,7 +176,8 @@ class Model(nn.Module):
         """Encoder and context module: what all tasks train."""
         assert isinstance(self.net, Network)
         yield from self.net.backbone.parameters()
-        yield from self.net.context.parameters()
+        if self.net.context is not None:
+            yield from self.net.context.parameters()
 
     def task_parameters(self) -> Iterator[nn.Parameter]:
         """Decoders, heads and further networks: each trained by one task only."""
@@ -189,17 +202,33 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
         ValueError: an unknown backbone, or an input that the pyramid does not divide.
     """
     sizes, data, timed = cell.recipe.network, cell.recipe.data, cell.recipe.latency
-    input_size = data.height, data.width
-    timed_size = timed.height or data.height, timed.width or data.width
-    for section, (height, width) in (("data", input_size), ("latency", timed_size)):
-        if height % sizes.strides[2] or width % sizes.strides[2]:
-            raise ValueError(
-                f"input {height}x{width} is not divisible by the deepest stride "
-                f"{sizes.strides[2]}: change {section}.height, {section}.width or network.strides"
-            )
     kind = plugins.load("backbones", cell.backbone)
-    backbone = kind(strides=sizes.strides, pretrained=cell.pretrained, **cell.backbone_args)
-    model = Model(Network(backbone, sizes, tasks), tasks)
+    given: dict[str, Any] = {"pretrained": cell.pretrained, **cell.backbone_args}
+    if kind.vector:
+        for task in tasks:
+            if task.reads_pyramid:
+                raise ValueError(
+                    f"task '{task.name}' reads maps, and backbone '{cell.backbone}' gives one "
+                    f"vector: choose another backbone"
+                )
+        given |= {"size": (data.height, data.width), "outputs": sizes.channels}
+    else:
+        lacking = sorted(set(sizes.strides) - set(kind.offered))
+        if lacking:
+            raise ValueError(
+                f"backbone '{cell.backbone}' has no features at stride {lacking[0]}: set "
+                f"network.strides to some of {', '.join(map(str, kind.offered))}"
+            )
+        given["strides"] = sizes.strides
+    divisor = divisor_of(cell)
+    timed_size = timed.height or data.height, timed.width or data.width
+    for section, (height, width) in (("data", (data.height, data.width)), ("latency", timed_size)):
+        if height % divisor or width % divisor:
+            raise ValueError(
+                f"input {height}x{width} is not divisible by the deepest stride {divisor}: "
+                f"change {section}.height, {section}.width or network.strides"
+            )
+    model = Model(Network(kind(**given), sizes, tasks), tasks)
     for task in tasks:
         model.add_extra(task, task.extra(sizes, cell.pretrained == "timm"))
     for module in model.modules():
@@ -216,5 +245,7 @@ def side_by_side(models: Iterable[Model]) -> Model:
 
 
 def _resize(x_BCHW: Tensor, size: torch.Size) -> Tensor:
-    """To the input's size, in float32 and with the paper's alignment of corners."""
+    """To the input's size, in float32, with the paper's alignment of corners; a vector stays."""
+    if x_BCHW.dim() == 2:
+        return x_BCHW.float()
     return F.interpolate(x_BCHW.float(), size, mode="bilinear", align_corners=True)

@@ -4,7 +4,7 @@ Cells of different status never share a line, and neither do measured, trivial a
 """
 
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -158,6 +158,10 @@ class Results:
             if part in (None, column.part)
             and any(g.entries[column.name].count for g in self.groups)
         ]
+
+    def tasks(self) -> set[str]:
+        """Those that some group has a metric of."""
+        return {column.task for column in self.columns("quality")}
 
 
 def tabulate(
@@ -351,7 +355,7 @@ def footnotes(results: Results) -> Iterator[str]:
     if results.reference is not None:
         yield from _relative(results, results.reference)
     if results.baseline:
-        yield _trivial()
+        yield _trivial(results.tasks())
     stale = [row for group in groups if group.status == "stale" for row in group.rows]
     if stale:
         why = ", ".join(dict.fromkeys(str(row["error"]) for row in stale if row.get("error")))
@@ -521,10 +525,10 @@ def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, 
     return captions
 
 
-def _trivial() -> str:
-    made = " and ".join(sorted(quality.words("trivial")))
+def _trivial(tasks: Collection[str]) -> str:
+    made = " and ".join(sorted(quality.words("trivial", tasks)))
     note = f"Trivial predictor: the training split's {made}. It looks at no image; a network has to"
-    return " ".join([f"{note} beat it.", *quality.words("trivial_note")])
+    return " ".join([f"{note} beat it.", *quality.words("trivial_note", tasks)])
 
 
 def counted_images(results: Results) -> Section | None:
@@ -538,7 +542,7 @@ def counted_images(results: Results) -> Section | None:
             sums = [Cell(f"{sum(several):g}" if several else NOTHING) for several in found]
             lines.append(TableRow.of(group.label, *sums))
     heads = (*Head.words(axis_title(results.axes[0])), *map(Head, counts.values()))
-    title = f"{'; '.join(quality.words('counted'))} (all seeds together)"
+    title = f"{'; '.join(quality.words('counted', results.tasks()))} (all seeds together)"
     return Section(title, heads, tuple(lines)) if lines else None
 
 
@@ -551,7 +555,8 @@ def _states(rows: Iterable[Row]) -> str:
 
 def _every_cell(rows: Sequence[Row]) -> Section | None:
     """Every cell on its own: slug, seed, status, and the numbers that carry the table."""
-    shown = [*(c for c in quality.quality() if c in quality.in_brief()), FPS]
+    brief = [column for column in quality.quality() if column in quality.in_brief()]
+    shown = [*(c for c in brief if any(single(row, c) != NOTHING for row in rows)), FPS]
     lines = []
     for row in rows:
         state = str(row.get("status", "done")) + " (smoke)" * bool(row.get("smoke"))

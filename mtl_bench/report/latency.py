@@ -355,9 +355,10 @@ def notes(timings: Timings) -> Iterator[str]:
         return
     where = ", ".join(timings.facts("device"))
     threads = " or ".join(timings.facts("threads"))
+    made = " and ".join(words("timed", timings.tasks))
     yield (
         f"Measured on {where}, {threads} thread{'s' * (threads != '1')}, batch 1: from the 8-bit "
-        f"image in host memory to {' and '.join(words('timed'))}, transfer and post-processing in. "
+        f"image in host memory to {made}, transfer and post-processing in. "
         "FPS is 1000 / mean; the three stages add up to the mean."
     )
     if len(timings.facts("device")) > 1:
@@ -376,7 +377,7 @@ def notes(timings: Timings) -> Iterator[str]:
         "differs too much is marked wrong and has no time."
     )
     if any(line.row.get("weights") == "random" for line in lines):
-        but = "".join(f", but {said}" for said in words("random"))
+        but = "".join(f", but {said}" for said in words("random", timings.tasks))
         yield f"Random weights: a convolution takes as long as with trained ones{but}."
     yield from _doubts(timings)
 

@@ -86,9 +86,12 @@ def draw(results: "Results", runs_root: Path, out_dir: Path) -> str | None:
     shown = found[:GROUPS]
     images = IMAGES if len(found) == len(shown) else IMAGES_OF_MANY
     lines = _lines([samples for _, samples in shown], images, _labels(results))
+    if not lines:  # what tasks predict are numbers
+        return None
     titles = ["input", "truth", *(label for label, _ in shown)]
     _draw_lines(lines, titles, results.smoke, out_dir, "samples")
-    maps = " and ".join(pictures().values())
+    kept = {key for _, samples in found for key in samples.maps}
+    maps = " and ".join(words for picture, words in pictures().items() if picture.key in kept)
     what = f"Input, ground truth and predictions on the first evaluation images: {maps}."
     return what + _left_out(found)
 

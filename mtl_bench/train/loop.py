@@ -196,11 +196,13 @@ def build_method(cell: Cell, terms: Sequence[Term]) -> Method:
 
 
 def schedule(step: int, optim: Optim) -> float:
-    """Learning-rate factor: polynomial decay times a linear warm-up."""
+    """Learning-rate factor: polynomial decay, a linear warm-up and milestones, multiplied."""
     warm = 1.0
     if step < optim.warmup_steps:
         warm = optim.warmup_factor + (1 - optim.warmup_factor) * step / optim.warmup_steps
-    found: float = warm * (1 - step / optim.steps) ** optim.poly_power
+    passed = sum(step >= milestone for milestone in optim.milestones)
+    decay: float = (1 - step / optim.steps) ** optim.poly_power
+    found: float = warm * decay * optim.milestone_factor**passed
     return found
 
 

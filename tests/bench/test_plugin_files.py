@@ -16,7 +16,7 @@ from mtl_bench.core.quality import columns_of, quality
 
 FOLDER = Path(__file__).parents[1] / "plugins"
 PLUGINS = [
-    ("tasks", "normals"),
+    ("tasks", "slopes"),
     ("tasks", "depth_silog"),
     ("datasets", "rooms"),
     ("backbones", "vit"),
@@ -31,12 +31,12 @@ backbone = ["vit"]
 [[row]]
 name = "three tasks"
 method = "pcgrad"
-tasks = ["panoptic", "depth_silog", "normals"]
+tasks = ["panoptic", "depth_silog", "slopes"]
 
 [[row]]
 name = "apart"
 method = "fixed"
-tasks = ["panoptic", "normals"]
+tasks = ["panoptic", "slopes"]
 single_task = true
 
 [report]
@@ -45,7 +45,7 @@ rows = "name"
 ROOMS = """
 about = "Rooms, in seconds"
 smoke = true
-tasks = ["panoptic", "normals"]
+tasks = ["panoptic", "slopes"]
 
 [data]
 dataset = "rooms"
@@ -95,7 +95,7 @@ def test_check(found, kind, name):
 def test_a_task_more_changes_no_id(monkeypatch):
     before = Cell(load_recipe("small"), "resnet18", "fixed").id
     monkeypatch.setenv(plugins.VARIABLE, str(FOLDER))
-    assert "normals" in plugins.files("tasks")
+    assert "slopes" in plugins.files("tasks")
     assert Cell(load_recipe("small"), "resnet18", "fixed").id == before
 
 
@@ -132,7 +132,7 @@ def test_a_data_set_of_ones_own_is_trained_on(found, tmp_path):
     (path,) = (tmp_path / "runs").glob("*/row.json")
     row = json.loads(path.read_text())
     assert row["protocol"]["dataset"] == "rooms"
-    assert row["metric"]["normals.mean_angle"] > 0
+    assert row["metric"]["slopes.mean_angle"] > 0
     assert {key.split(".")[2] for key in row["metric"] if key.startswith("semantic.class.")} == {
         "floor",
         "wall",

@@ -99,7 +99,9 @@ def test_recipes_load_and_differ():
     assert (
         len({replace(CELL, recipe=recipe).id for recipe in recipes}) == len(names) - 1
     )  # cityscapes-video: its second stage
-    assert [recipe.name for recipe in recipes if recipe.smoke] == ["cost", "kitti-smoke", "smoke"]
+    assert [recipe.name for recipe in recipes if recipe.smoke] == [
+        *("cost", "dense-smoke", "kitti-smoke", "smoke")
+    ]
     assert all(recipe.about for recipe in recipes)
 
 

@@ -1,6 +1,9 @@
-"""What every task has to hold, tried on the built-in data with a small network."""
+"""What every task has to hold, tried on data at hand with a small network."""
 
+import atexit
 import functools
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +15,9 @@ from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, load_recipe
 from mtl_bench.core.dataset import NEIGHBOURS, DecodedFrame, Kind, dataset_of
 from mtl_bench.core.labels import OUTSIDE
-from mtl_bench.core.plugins import files
+from mtl_bench.core.plugins import files, load
 from mtl_bench.core.quality import columns_of
+from mtl_bench.core.recipe import Recipe
 from mtl_bench.core.task import Results, Task, tasks_of, terms_of
 from mtl_bench.data.augment import OUTSIDE_OF
 from mtl_bench.data.loader import eval_batches, train_batches
@@ -24,39 +28,65 @@ from mtl_bench.model import Model, build_model
 RECIPE, BACKBONE = "smoke", "tiny"
 
 
+def _recipe(kind: type[Task]) -> tuple[Recipe, str] | None:
+    """The smoke recipe with a data set at hand that has what a task needs, and the task's field."""
+    smoke, wanted = load_recipe(RECIPE), kind.needs | kind.truth
+    first = smoke.data.dataset.replace("-", "_")
+    for name in (first, *(name for name in files("datasets") if name != first)):
+        dataset = load("datasets", name)
+        fields = dataset.predicts.get(kind.name, ()) if kind.of_field else ("",)
+        has = dataset.fields.keys() | ({NEIGHBOURS} if name == first else set())
+        if fields and wanted <= has:
+            data = replace(smoke.data, dataset=name.replace("_", "-"))
+            recipe = replace(smoke, data=data)
+            if _root(recipe) is not None:
+                return recipe, fields[0]
+    return None
+
+
 @functools.cache
-def _root() -> Path:
-    recipe = load_recipe(RECIPE)
-    return dataset_of(recipe).render(recipe.data, quiet=True)
+def _root(recipe: Recipe) -> Path | None:
+    """A few frames: rendered, or the example that the data set writes, where it does."""
+    dataset = dataset_of(recipe)
+    if dataset.built_in:
+        return dataset.render(recipe.data, quiet=True)
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder)
+    return folder if dataset.example(folder, recipe.data) else None
 
 
 def _model(kind: type[Task]) -> Model:
     """A network with this task and those whose results it reads."""
-    recipe = load_recipe(RECIPE)
-    names = (kind.name, *(name for name in kind.after if name in files("tasks")))
+    found = _recipe(kind)
+    assert found is not None
+    recipe, field = found
+    own = f"{kind.name}:{field}" if field else kind.name
+    names = (own, *(name for name in kind.after if name in files("tasks")))
     tasks = tasks_of(recipe, names, dataset_of(recipe).labels)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return build_model(Cell(recipe, BACKBONE, "", names), tasks)
 
 
-def _on_built_in(check: Callable[[type[Task]], str | None]) -> Callable[[type[Task]], str | None]:
-    """Only where the built-in data have what the task needs."""
+def _on_data(check: Callable[[type[Task]], str | None]) -> Callable[[type[Task]], str | None]:
+    """Only where some data have what the task needs."""
 
     def checked(kind: type[Task]) -> str | None:
-        has = dataset_of(load_recipe(RECIPE)).fields.keys() | {NEIGHBOURS}
-        lacking = sorted((kind.needs | kind.truth) - has)
-        if lacking:
-            return f"not tried: the built-in data have no {', '.join(lacking)}"
+        if _recipe(kind) is None:
+            lacking = sorted(
+                (kind.needs | kind.truth) - dataset_of(load_recipe(RECIPE)).fields.keys()
+            )
+            return f"not tried: no data set at hand has {', '.join(lacking) or 'a field for it'}"
         return check(kind)
 
     return checked
 
 
 def _batch(model: Model, training: bool) -> Batch:
-    recipe = load_recipe(RECIPE)
-    split = "train" if training else recipe.evaluate.split
-    samples = open_samples(recipe, model.tasks, split, _root(), training)
+    recipe = model.tasks[0].recipe
+    split, root = "train" if training else recipe.evaluate.split, _root(recipe)
+    assert root is not None
+    samples = open_samples(recipe, model.tasks, split, root, training)
     if training:
         for task in model.tasks:
             task.begin(samples.dataset)
@@ -65,7 +95,7 @@ def _batch(model: Model, training: bool) -> Batch:
 
 
 def _own(model: Model, kind: type[Task]) -> Task:
-    return next(task for task in model.tasks if task.name == kind.name)
+    return next(task for task in model.tasks if isinstance(task, kind))
 
 
 def _declared(kind: type[Task]) -> None:
@@ -87,11 +117,12 @@ def _losses(kind: type[Task]) -> None:
     wanted = {term.name for term in terms_of(model.tasks)}
     if set(losses) != wanted:
         raise ValueError(f"losses {sorted(losses)} are not the terms {sorted(wanted)}")
-    own = [losses[term.name] for term in kind.terms]
+    task = _own(model, kind)
+    own = [losses[term.name] for term in task.terms]
     if not all(loss.dim() == 0 and torch.isfinite(loss) for loss in own):
         raise ValueError(f"losses {[loss.tolist() for loss in own]} are no finite scalars")
     torch.stack(own).sum().backward()
-    heads = _own(model, kind).head((8, 8, 8), load_recipe(RECIPE).network).heads
+    heads = task.head((8, 8, 8), task.recipe.network).heads
     trained = {
         name.split(".")[1]
         for name, parameter in model.net.named_parameters()
@@ -106,8 +137,10 @@ _BLANK = {Kind.IDS, Kind.DEPTH, Kind.INVERSE_DEPTH, Kind.NORMALS}  # their paddi
 
 def _no_pixels(kind: type[Task]) -> str | None:
     """Of a sample that is all padding, no term is there: a loss of 0 would call it solved."""
-    model, recipe = _model(kind).train(), load_recipe(RECIPE)
-    samples = open_samples(recipe, model.tasks, "train", _root(), training=True)
+    model = _model(kind).train()
+    task, root = _own(model, kind), _root(model.tasks[0].recipe)
+    assert root is not None
+    samples = open_samples(task.recipe, model.tasks, "train", root, training=True)
     kinds, read = samples.dataset.fields, samples.dataset.read
     valued = sorted(name for name in kind.needs & kinds.keys() if kinds[name] not in _BLANK)
     if valued:
@@ -123,10 +156,10 @@ def _no_pixels(kind: type[Task]) -> str | None:
         return replace(frame, fields=fields, static=outside)
 
     samples.dataset.read = padding  # type: ignore[method-assign]
-    for task in model.tasks:
-        task.begin(samples.dataset)
+    for each in model.tasks:
+        each.begin(samples.dataset)
     batch = next(train_batches(samples, 2, seed=0))
-    found = _own(model, kind).losses(model(batch).maps[kind.name], batch)
+    found = task.losses(model(batch).maps[task.name], batch)
     if found:
         raise ValueError(
             f"a sample without a valid pixel has the terms {', '.join(found)}: leave out a term "
@@ -144,7 +177,8 @@ def _measures(kind: type[Task]) -> None:
     """Results have one entry a frame; the metrics have the columns; two halves add up."""
     model = _model(kind)
     batch = _batch(model, training=False)
-    found, task = _results(model, batch)[kind.name], _own(model, kind)
+    task = _own(model, kind)
+    found = _results(model, batch)[task.name]
     uneven = [name for name, value in found.items() if len(value) != len(batch.names)]
     if uneven:
         raise ValueError(f"results {', '.join(uneven)} have not one entry a frame")
@@ -167,9 +201,10 @@ def _batched(kind: type[Task]) -> None:
     """A frame's results do not depend on its neighbours in the batch."""
     model = _model(kind)
     batch = _batch(model, training=False)
-    together = _results(model, batch)[kind.name]
+    task = _own(model, kind)
+    together = _results(model, batch)[task.name]
     for slot, part in enumerate(batch.split(1)):
-        for name, value in _results(model, part)[kind.name].items():
+        for name, value in _results(model, part)[task.name].items():
             if not _near(value[0], together[name][slot]):
                 raise ValueError(f"'{name}' of a frame differs in a batch of two")
 
@@ -182,8 +217,8 @@ def _near(a: Tensor, b: Tensor) -> bool:
 
 TASK_CHECKS: dict[str, Callable[[type[Task]], str | None]] = {
     "declared": lambda kind: _declared(kind),
-    "losses train it": _on_built_in(_losses),
-    "no pixels, no terms": _on_built_in(_no_pixels),
-    "metrics have its columns": _on_built_in(_measures),
-    "frames alone and together": _on_built_in(_batched),
+    "losses train it": _on_data(_losses),
+    "no pixels, no terms": _on_data(_no_pixels),
+    "metrics have its columns": _on_data(_measures),
+    "frames alone and together": _on_data(_batched),
 }

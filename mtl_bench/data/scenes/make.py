@@ -23,10 +23,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mtl_bench.core.recipe import Data
-from mtl_bench.data.scenes import cityscapes, kitti
-from mtl_bench.data.scenes.settings import CITYSCAPES, KITTI, Settings
+from mtl_bench.data.scenes import arrays, cityscapes, kitti
+from mtl_bench.data.scenes.settings import CITYSCAPES, CITYSCAPES_ARRAYS, KITTI, NYUV2, Settings
 
-_WRITERS = {CITYSCAPES: cityscapes, KITTI: kitti}
+_WRITERS = {CITYSCAPES: cityscapes, KITTI: kitti, NYUV2: arrays, CITYSCAPES_ARRAYS: arrays}
 _SINGLE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 

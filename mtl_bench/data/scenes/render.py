@@ -169,6 +169,23 @@ def truth(scene: Scene, frame: int) -> Truth:
     return Truth(index, label, things, np.where(index >= 0, depth, 0).astype(np.float32))
 
 
+def normals(scene: Scene, frame: int, seen: Truth) -> FloatArray:
+    """Unit normals [H,W,3] of a frame, x right, y down, z forward; 0 = sky or ego vehicle."""
+    solids, pose, time = scene.solids, scene.motion.poses[frame], frame - scene.annotated
+    rows, cols = np.nonzero(seen.index_HW >= 0)
+    index, (u, v) = seen.index_HW[rows, cols], _centres(scene.camera)
+    x, y = scene.camera.rays(u[cols], v[rows])
+    point = np.stack([x, y, np.ones_like(x)], 1) * seen.depth_HW[rows, cols, None]
+    directions, origins = unit_frames(solids, pose, time)
+    unit = origins[index] + (directions[index] * point[:, None, :]).sum(2)
+    face = unit_normals(solids.kind_P[index], unit, solids.taper_P3[index])
+    # A plane's normal goes over from unit space to the camera's by the transpose of the way back.
+    normal = (directions[index] * face[:, :, None]).sum(1)
+    found = np.zeros((*seen.index_HW.shape, 3), np.float32)
+    found[rows, cols] = normal / np.sqrt((normal * normal).sum(1, keepdims=True))
+    return found
+
+
 def instance_ids(seen: Truth, min_area: int) -> NDArray[np.uint16]:
     """Cityscapes' ids: label id, or label id * 1000 + number for a thing.
 

@@ -13,6 +13,7 @@ from mtl_bench.data import png
 from mtl_bench.data.scenes.render import RENDERER_VERSION
 
 CITYSCAPES, KITTI = "Cityscapes", "KITTI raw"  # layouts of files
+NYUV2, CITYSCAPES_ARRAYS = "NYUv2 arrays", "Cityscapes arrays"
 SPLITS = ("train", "val", "test")
 
 

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from mtl_bench.core import config
+from mtl_bench.core.backbone import divisor_of
 from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.canvas import Image
 from mtl_bench.core.dataset import dataset_of
@@ -63,7 +64,7 @@ class Predictor:
     ) -> None:
         self.model, self.cell, self.device = model, cell, device
         self.labels = dataset_of(cell.recipe).labels
-        data, stride = cell.recipe.data, cell.recipe.network.strides[2]
+        data, stride = cell.recipe.data, divisor_of(cell)
         self.stride = stride
         self.size = size or (data.height, data.width)
         if min(self.size) < stride or any(pixels % stride for pixels in self.size):

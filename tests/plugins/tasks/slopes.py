@@ -15,37 +15,37 @@ from mtl_bench.core.terms import Term
 from mtl_bench.model.layers import DenseHead
 
 
-class Normals(Task):
-    terms = (Term("angle", "normals", "regression", 1.0),)
+class Slopes(Task):
+    terms = (Term("angle", "slopes", "regression", 1.0),)
     needs = truth = frozenset({"depth_m"})
-    maps = {"normals": MapInfo("normals")}
-    exported = ("normals",)
+    maps = {"slopes": MapInfo("slopes")}
+    exported = ("slopes",)
     columns = (
         Column(
-            *("mean_angle", "normals.mean_angle", "mean angle", -1, 1, "deg"),
+            *("mean_angle", "slopes.mean_angle", "mean angle", -1, 1, "deg"),
             in_delta=True,
             headline=True,
             words="angular error",
         ),
-        Column("within_30", "normals.within_30", "< 30 deg", +1, 3),
+        Column("slope_30", "slopes.within_30", "< 30 deg", +1, 3),
     )
 
     def head(self, inputs, sizes):
-        return DenseHead("normals", inputs, sizes, 3)
+        return DenseHead("slopes", inputs, sizes, 3)
 
     def targets(self, sample):
-        return {"normals": normals_of(sample.fields["depth_m"][None], sample.camera.K_B33[None])[0]}
+        return {"slopes": normals_of(sample.fields["depth_m"][None], sample.camera.K_B33[None])[0]}
 
     def losses(self, maps, batch):
-        cosine_N = cosine(maps["normals"].float(), batch.fields["normals"])
+        cosine_N = cosine(maps["slopes"].float(), batch.fields["slopes"])
         return {"angle": (1 - cosine_N).mean()} if len(cosine_N) else {}
 
     def finish(self, maps, camera, done, size=None):
-        if size not in (None, tuple(maps["normals"].shape[2:])):
+        if size not in (None, tuple(maps["slopes"].shape[2:])):
             maps = self.resized(maps, size)
-        count = len(maps["normals"])
+        count = len(maps["slopes"])
         return {
-            "normals": F.normalize(maps["normals"].float(), dim=1),
+            "slopes": F.normalize(maps["slopes"].float(), dim=1),
             "K": camera.K_B33.expand(count, 3, 3),
         }
 
@@ -62,7 +62,7 @@ class MeanAngle(Metric):
         self.sums = torch.zeros(3, dtype=torch.float64)  # degrees, pixels below 30, pixels
 
     def update(self, truth, result):
-        depth_HW, found_3HW = torch.as_tensor(truth["depth_m"]), torch.as_tensor(result["normals"])
+        depth_HW, found_3HW = torch.as_tensor(truth["depth_m"]), torch.as_tensor(result["slopes"])
         true_3HW = normals_of(depth_HW[None], torch.as_tensor(result["K"])[None])[0]
         valid_HW = true_3HW.square().sum(0) > 0.5
         angle_N = torch.rad2deg((true_3HW * found_3HW).sum(0)[valid_HW].clamp(-1, 1).acos())
@@ -79,7 +79,7 @@ class MeanAngle(Metric):
         degrees, below, pixels = self.sums.tolist()
         if not pixels:
             return {}
-        return {"normals.mean_angle": degrees / pixels, "normals.within_30": below / pixels}
+        return {"slopes.mean_angle": degrees / pixels, "slopes.within_30": below / pixels}
 
 
 def normals_of(depth_BHW: Tensor, K_B33: Tensor) -> Tensor:

@@ -1,0 +1,24 @@
+"""The built-in scenes in the layout of Cityscapes' arrays: 7 classes and exact inverse depth.
+
+Source: `scenes/`, rendered into the user's cache by seed and number of the scene; splits as of
+`synthetic-nyuv2`.
+"""
+
+from pathlib import Path
+from typing import ClassVar
+
+from mtl_bench.core.recipe import Data
+from mtl_bench.data.cityscapes_mtan import CityscapesMtan
+
+
+class SyntheticCityscapesMtan(CityscapesMtan):
+    """Street scenes, rendered on first use; what the numbers say is of them alone."""
+
+    built_in: ClassVar[bool] = True
+    published: ClassVar[dict[str, int]] = {}
+
+    @classmethod
+    def render(cls, data: Data, quiet: bool = False) -> Path:
+        from mtl_bench.data import scenes
+
+        return scenes.ensure(data, progress=not quiet, layout=cls.layout)
