@@ -20,7 +20,8 @@ from mtl_bench.cli import cell, data, deploy, figure, grid, look, predict, pseud
 from mtl_bench.core.locks import CLAIMED, ClaimedError
 
 TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # no space, over quota, read-only
+# no space, over quota, over the size of a file, read-only
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 USERS = (FileNotFoundError, PermissionError, NotADirectoryError, IsADirectoryError)
 
 

@@ -13,6 +13,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from mtl_bench.core.columns import Column
+from mtl_bench.core.files import write_text
 from mtl_bench.report.columns import Row, capital, measured
 from mtl_bench.report.statistics import Entry
 
@@ -205,9 +206,7 @@ def write(table: Table, out_dir: Path, more: Mapping[str, str]) -> Path:
     out_dir.mkdir(parents=True, exist_ok=True)
     files = {"table.csv": csv(table), "table.md": markdown(table), "table.tex": latex(table)}
     for name, content in {**files, **more}.items():
-        temporary = out_dir / f".{name}.tmp"
-        temporary.write_text(content, encoding="utf-8", newline="\n")
-        temporary.replace(out_dir / name)
+        write_text(out_dir / name, content)
     return out_dir / "index.html"
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mtl_bench.data.scenes.render import RENDERER_VERSION
 
 CITYSCAPES, KITTI = "Cityscapes", "KITTI raw"  # layouts of files
+RECORD = "synthetic.json"  # in a data set's folder: its settings
 SPLITS = ("train", "val", "test")
 _FAST = [cv2.IMWRITE_PNG_COMPRESSION, 2]
 
@@ -69,13 +70,17 @@ class Settings:
 
     @property
     def key(self) -> str:
-        return hashlib.sha256(json.dumps(self.values, sort_keys=True).encode()).hexdigest()[:12]
+        return key_of(self.values)
 
     def write(self, root: Path) -> None:
         """Leave beside the data set what it was made from."""
-        (root / "synthetic.json").write_text(json.dumps(self.values, indent=4) + "\n")
+        (root / RECORD).write_text(json.dumps(self.values, indent=4) + "\n")
+
+
+def key_of(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def write_png(path: Path, image: NDArray[Any]) -> None:
-    if not cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image, _FAST):
-        raise OSError(f"cannot write {path}")
+    encoded = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image, _FAST)[1]
+    path.write_bytes(encoded.tobytes())
