@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.core.config import Cell, did_you_mean
+from mtl_bench.core.config import FROZEN, Cell, did_you_mean
 from mtl_bench.core.fingerprint import ancestry, of_package
 from mtl_bench.core.fingerprint import load as load_text
 
@@ -423,6 +423,7 @@ def check_cells(cells: Iterable[Cell]) -> None:
             seen.add((kind, name, tuple(values)))
             path_of(kind, name)
             known = settings(kind, name) if values else {}  # importing torch takes seconds
+            known |= {FROZEN: None} if kind == "backbones" else {}
             for key in values:
                 if key not in known:
                     word = kind[:-1]

@@ -6,7 +6,7 @@ Shapes: B images, C channels, H x W input pixels, h x w cells of the finest stri
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from mtl_bench.core import config, plugins
 from mtl_bench.core.backbone import Backbone
 from mtl_bench.core.batch import Batch
+from mtl_bench.core.config import FROZEN
+from mtl_bench.core.plain import did_you_mean
 from mtl_bench.core.task import Maps, Task, TaskHead
 from mtl_bench.model.layers import GlobalContext, Normalize, init_fan_in
 
@@ -29,6 +31,8 @@ class Outputs:
 
 class Network(nn.Module):
     """What runs at inference. In training mode it also predicts what only losses read."""
+
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"train": ("freeze", "train")}
 
     def __init__(self, backbone: Backbone, sizes: config.Network, tasks: Sequence[Task]):
         super().__init__()
@@ -54,6 +58,27 @@ class Network(nn.Module):
                     )
                 ours.update(dict(own.items()))
             self._parts[task.name] = part
+
+    def freeze(self, what: str) -> None:
+        """Let the backbone's stem, or all of the backbone, learn no more.
+
+        Raises:
+            ValueError: neither of them, or a backbone that names no stem.
+        """
+        known = {"stem": self.backbone.stem, "all": self.backbone.parameters}
+        if what not in known:
+            raise ValueError(f"backbone.{FROZEN} is not '{what}'{did_you_mean(what, known)}")
+        for parameter in known[what]():
+            parameter.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> Self:
+        """Statistics of what is frozen stay as they are, too."""
+        super().train(mode)
+        for module in self.backbone.modules():
+            own = list(module.parameters(recurse=False))
+            if own and not any(parameter.requires_grad for parameter in own):
+                module.eval()
+        return self
 
     def keep(self, names: Collection[str]) -> None:
         """Drop the decoders and heads of other tasks."""
@@ -186,7 +211,8 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
     """The cell's model with fresh (or, where the cell says so, pre-trained) weights.
 
     Raises:
-        ValueError: an unknown backbone, or an input that the pyramid does not divide.
+        ValueError: an unknown backbone, an input that the pyramid does not divide, or a part to
+            freeze that is none.
     """
     sizes, data = cell.recipe.network, cell.recipe.data
     if data.height % sizes.strides[2] or data.width % sizes.strides[2]:
@@ -195,8 +221,14 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
             f"{sizes.strides[2]}: change data.height, data.width or network.strides"
         )
     kind = plugins.load("backbones", cell.backbone)
-    backbone = kind(strides=sizes.strides, pretrained=cell.pretrained, **cell.backbone_args)
-    model = Model(Network(backbone, sizes, tasks), tasks)
+    arguments = dict(cell.backbone_args)
+    frozen = arguments.pop(FROZEN, None)
+    network = Network(
+        kind(strides=sizes.strides, pretrained=cell.pretrained, **arguments), sizes, tasks
+    )
+    if frozen is not None:
+        network.freeze(str(frozen))
+    model = Model(network, tasks)
     for task in tasks:
         model.add_extra(task, task.extra(sizes, cell.pretrained == "timm"))
     for module in model.modules():
