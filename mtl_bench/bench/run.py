@@ -125,7 +125,7 @@ def renew(
     code = provenance.code(cell)
     stale = store.changed({**row["code"], "data": row.get("data")}, cell, data)
     unsure = store.unsure(stale)
-    if "evaluate" in stale or unsure:
+    if "evaluate" in stale:
         if cell.single_task:
             for parent in cell.parents:
                 _result_of(parent, run_dir.parent, data)

@@ -285,9 +285,11 @@ def can_renew(cell: Cell, runs: Path, data: Data | None = None) -> bool:
 
 
 def unsure(stale: Mapping[str, str]) -> bool:
-    """Whether the training may be as good as it was, which an evaluation as before tells."""
-    evaluation = stale.get("evaluate", provenance.TOUCHED)
-    return stale.get("train") in provenance.UNSURE and evaluation in provenance.UNSURE
+    """Whether the training may be as good as it was, which an evaluation as before tells.
+
+    Not so where the files of training alone were written anew: that one would not see them.
+    """
+    return all(stale.get(stage) in provenance.UNSURE for stage in ("train", "evaluate"))
 
 
 def set_aside(directory: Path, why: str) -> str:

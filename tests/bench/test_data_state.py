@@ -101,6 +101,19 @@ def test_data_of_evaluation_alone_cost_no_training(tmp_path):
     assert state.stale.keys() == {"evaluate"}
 
 
+def test_training_files_alone_written_anew_are_not_told_by_an_evaluation(tmp_path):
+    root = tmp_path / "data"
+    for split in ("train", "val"):
+        cityscapes_tree.write_tree(root, 3, split)
+    cell = in_layout_of("cityscapes", cityscapes_tree)
+    stored = row(cell, root)
+    touched(images(root, "train")[0])
+    state = store.state_of(stored, cell, Data(root))
+    assert state.why == "train: its data's files were written anew"
+    assert not state.trained
+    assert not store.unsure(state.stale)
+
+
 def test_a_copy_is_told_by_contents_on_request_and_else_by_an_evaluation(found, monkeypatch):
     cell, root = found
     stored = row(cell, root)
@@ -131,8 +144,9 @@ def test_generated_data_count_by_their_settings(smoke_cell, smoke_root, tmp_path
     assert "other data, generated from other settings" in state.why
     assert not store.unsure(state.stale)
     (again / "synthetic.json").write_text(json.dumps(settings))
-    with images(again, "train")[0].open("ab") as opened:
-        opened.write(b"more")
+    for split in ("train", "val"):  # as another version of the encoder would do
+        with images(again, split)[0].open("ab") as opened:
+            opened.write(b"more")
     assert store.unsure(store.state_of(stored, smoke_cell, Data(again)).stale)
     of_a_folder = row(smoke_cell, again)
     (again / "synthetic.json").unlink()
