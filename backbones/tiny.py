@@ -3,6 +3,7 @@
 Not a published network; its numbers mean nothing.
 """
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 from torch import Tensor, nn
@@ -24,6 +25,9 @@ class Tiny(Backbone):
             for i, o in pairwise(widths[: depth + 1])
         )
         self.channels = {stride: widths[stride.bit_length() - 1] for stride in strides}
+
+    def stem(self) -> Iterator[nn.Parameter]:
+        return self.stages[0].parameters()
 
     def forward(self, image_B3HW: Tensor) -> dict[int, Tensor]:
         found, x = {}, image_B3HW

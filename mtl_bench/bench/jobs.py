@@ -137,15 +137,24 @@ def load_cell(path: Path) -> Cell:
 
 
 def load_run(path: Path) -> tuple[Cell, Path]:
-    """A trained cell and its checkpoint, from a folder in runs/ or the checkpoint.
+    """A trained cell and its checkpoint, from a folder in runs/ or the checkpoint alone.
 
     Raises:
-        ValueError: neither is there.
+        ValueError: neither is there, or the checkpoint is another cell's.
     """
     if not path.exists():
         raise ValueError(f"no run or checkpoint '{path}'")
-    checkpoint = path / "last.pt" if path.is_dir() else path
-    return load_cell(checkpoint.parent / "cell.json"), checkpoint
+    from mtl_bench.train import checkpoint  # takes seconds, for torch
+
+    weights, beside = path / "last.pt", path / "cell.json"
+    if not path.is_dir():
+        weights, beside = path, path.with_name("cell.json")
+        if "cell" in checkpoint.read(weights, lazily=True) or not beside.is_file():
+            return checkpoint.cell_of(weights), weights
+    cell = load_cell(beside)
+    if weights.is_file():
+        checkpoint.require(weights, cell)
+    return cell, weights
 
 
 def with_parents(jobs: Iterable[Job]) -> tuple[Job, ...]:
@@ -170,6 +179,7 @@ class Kind(ABC, Generic[J]):
     again: Mapping[str, tuple[str, ...]]  # --rerun -> what it runs beside
     why: str  # the key in a row for what is wrong
     stages: tuple[str, ...]
+    owner: tuple[str, ...]  # of what a row says of its job: what tells it from another's
     row: str  # behind a job's slug: its row
     log: str  # and what its process printed
 
@@ -229,6 +239,7 @@ class Cells(Kind[Cell]):
     }
     why = "error"
     stages = STAGES
+    owner = ("cell_id",)
     row, log = "/row.json", "/log.txt"
 
     def code(self, job: Cell) -> provenance.Code:
@@ -243,6 +254,8 @@ class Cells(Kind[Cell]):
         values = to_dict(job)
         if job.pretrained is not None:
             values["pretrained"] = Path(job.pretrained).name
+        if job.continues is not None:
+            values["continues"] = job.continues.slug
         keys = ("method", "backbone", "tasks", "seed", "video", "single_task", "granularity")
         return {
             "cell_id": job.id,
@@ -281,6 +294,7 @@ class Timings(Kind[Timing]):
     }
     why = "why"
     stages = ("time",)
+    owner = ("backbone", "tasks", "engine", "precision", "height", "width")
     row, log = ".json", ".log"
 
     def code(self, job: Timing) -> provenance.Code:

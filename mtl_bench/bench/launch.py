@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mtl_bench.bench import store
+from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.jobs import Job, Timing, kind_of, with_parents
 from mtl_bench.bench.jobs import lack as lack_of
 from mtl_bench.bench.store import State
@@ -124,6 +125,7 @@ class Run(ABC):
 @dataclass
 class CellRun(Run):
     command: CellCommand = field(kw_only=True)
+    data: Data | None = None
 
     @property
     def directory(self) -> Path:
@@ -136,7 +138,7 @@ class CellRun(Run):
     def settled(self, state: State) -> State | None:
         """A parent without a result that may be used keeps a cell from ever running."""
         for parent in self.job.parents:
-            found = store.inspect(parent, self.runs)
+            found = store.inspect(parent, self.runs, self.data)
             if not found.trained:
                 remedy = "; --rerun stale" if found.word == "stale" else ""
                 why = f" ({found.why}{remedy})" if found.why else ""
@@ -164,8 +166,8 @@ class CellRun(Run):
             log = self.log.read_text(errors="replace")
             store.write_failure(self.directory, explain_exit(code, log), log, code)
         if code and kept:  # of a row that was to be renewed
-            return State("failed", str(read_json(failure)["error"]))
-        return store.stored(self.job, self.runs)
+            return State("failed", str((read_json(failure) or {}).get("error")))
+        return store.stored(self.job, self.runs, self.data)
 
 
 @dataclass
@@ -231,6 +233,7 @@ class Launcher:
         names: id -> what the grid calls it.
         lack: why a timing cannot be taken on this machine; then no process is started for it.
         smoke: stands in the rows of timings.
+        data: those that cells run on.
     """
 
     runs: Path
@@ -241,6 +244,7 @@ class Launcher:
     names: Mapping[str, str] = field(default_factory=dict)
     lack: Callable[[Timing], str | None] = lack_of
     smoke: bool = False
+    data: Data | None = None
     _running: list[Run] = field(default_factory=list)
     _unsettled: set[str] = field(default_factory=set)  # ids whose jobs have not ended here yet
     _elsewhere: set[str] = field(default_factory=set)  # ids that another process was seen running
@@ -276,14 +280,14 @@ class Launcher:
         given = (number, total, job, self.runs, self.names.get(job.id, ""))
         if isinstance(job, Timing):
             return TimingRun(*given, command=self.command, lack=self.lack, smoke=self.smoke)
-        return CellRun(*given, command=self.command)
+        return CellRun(*given, command=self.command, data=self.data)
 
     def _fill(self, queue: deque[Run]) -> None:
         """Start queued jobs in free places; those that must wait keep their place in the queue."""
         waiting = []
         while queue and len(self._running) < self.jobs:
             run = queue.popleft()
-            state = store.inspect(run.job, self.runs)
+            state = store.inspect(run.job, self.runs, self.data)
             if state.word == "running":
                 if run.job.id not in self._elsewhere:
                     self.display.say(f"{run.label}  is run by another process")
@@ -422,6 +426,7 @@ class Here:
     Args:
         root: the data set.
         echo: where lines of text go.
+        data: what cells are compared with; those in the root that need not be rendered for that.
     """
 
     runs: Path
@@ -429,6 +434,7 @@ class Here:
     device: str
     wandb: str
     echo: Callable[[str], None]
+    data: Data
 
     def run(self, cell: Cell, rerun: bool = False, stale: bool = False) -> None:
         """Run what is left of a cell, after the cells that it needs.
@@ -443,7 +449,7 @@ class Here:
         """
         for parent in with_parents(cell.parents):
             assert isinstance(parent, Cell)
-            state = store.inspect(parent, self.runs)
+            state = store.inspect(parent, self.runs, self.data)
             if state.word == "stale" and not state.trained:
                 again = f"mtl-bench train {store.run_dir(parent, self.runs)}/cell.json --stale"
                 raise ValueError(f"a cell that this one needs is stale, {state.why}: {again}")
@@ -457,13 +463,15 @@ class Here:
         with claim(directory):
             if rerun:
                 store.clear(directory)
-            elif line := store.done_already(cell, self.runs, stale):  # meanwhile, by another
+            elif line := store.done_already(
+                cell, self.runs, stale, self.data
+            ):  # meanwhile, by another
                 self.echo(line)
                 return
-            renewed = stale and store.can_renew(cell, self.runs)
-            if not renewed:
-                self._begin(cell, rerun)
+            renewed = stale and store.can_renew(cell, self.runs, self.data)
             with _recorded(directory):
+                if not renewed:
+                    self._begin(cell, rerun)
                 from mtl_bench.bench.run import renew, run_cell
 
                 if renewed:
@@ -473,14 +481,16 @@ class Here:
         self.echo(f"{directory}/row.json")
 
     def _begin(self, cell: Cell, rerun: bool) -> None:
-        state = store.stored(cell, self.runs)
+        state = store.stored(cell, self.runs, self.data)
+        if state.row is None and (store.run_dir(cell, self.runs) / "row.json").is_file():
+            self.echo(f"its row is made anew: {state.why}")
         if state.word == "stale":
             self.echo(store.set_aside(store.run_dir(cell, self.runs), state.why))
-        if line := store.begin(cell, self.runs)[1]:
+        if line := store.begin(cell, self.runs, self.data)[1]:
             self.echo(line)
         from mtl_bench.bench.reuse import adopt
 
-        if not rerun and (line := adopt(cell, self.runs)):
+        if not rerun and (line := adopt(cell, self.runs, self.data)):
             self.echo(line)
 
 

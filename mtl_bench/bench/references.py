@@ -10,7 +10,7 @@ from typing import Any
 
 from mtl_bench.bench import store
 from mtl_bench.bench.grid import Grid, baseline_cell, load_grid
-from mtl_bench.core.config import to_dict
+from mtl_bench.core.config import Cell, to_dict
 from mtl_bench.core.files import read_json, write_json
 
 SEEDS = 10  # of the quality beside the speed: those below this that are done are averaged
@@ -59,6 +59,15 @@ def _trivial_file(grid: Grid, runs: Path) -> Path | None:
 def _tasks(grid: Grid) -> tuple[str, ...]:
     """Those that some cell has, as the cells name them."""
     return tuple(dict.fromkeys(task for cell in grid.cells for task in cell.tasks))
+
+
+def baselines(grid: Grid) -> tuple[Cell, ...]:
+    """The cells that deltas are against, whether they are in a row or not, each once."""
+    if not grid.baseline:
+        return ()
+    skipped = {skip.job.id for skip in grid.skips}
+    found = {cell.id: cell for cell in (baseline_cell(c, grid.baseline) for c in grid.cells)}
+    return tuple(cell for cell in found.values() if cell.id not in skipped)
 
 
 def baseline_row(grid: Grid, row: Mapping[str, Any], runs: Path) -> dict[str, Any] | None:

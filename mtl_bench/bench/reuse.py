@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from mtl_bench.bench import store
+from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.jobs import load_cell
 from mtl_bench.bench.run import TAKEN
 from mtl_bench.core.config import Cell, training_json
@@ -20,8 +21,11 @@ from mtl_bench.train.loop import CHECKPOINT
 BESIDE = ("curve.csv", TAKEN, "pseudo_labels")  # what a checkpoint's row is made of, too
 
 
-def adopt(cell: Cell, runs: Path) -> str:
+def adopt(cell: Cell, runs: Path, data: Data | None = None) -> str:
     """Copy a finished training that is this cell's into its folder, where there is one in runs/.
+
+    Args:
+        data: what the cell is trained on; None: it is not asked.
 
     Returns:
         A line that says so; empty where none was found, or the cell has begun its own.
@@ -32,7 +36,9 @@ def adopt(cell: Cell, runs: Path) -> str:
     alike = f"{cell.method}-{cell.backbone}-s{cell.seed}-*/{CHECKPOINT}"
     for path in sorted(runs.glob(alike)):
         try:
-            state = checkpoint.read(path) if _of_this_training(cell, path.parent) else {"step": 0}
+            state = {"step": 0}
+            if _of_this_training(cell, path.parent, data):
+                state = checkpoint.read(path)
         except ValueError:
             continue  # a damaged cell is told where it is asked for, and hurts no other
         if state["step"] < cell.recipe.optim.steps:
@@ -48,10 +54,10 @@ def adopt(cell: Cell, runs: Path) -> str:
     return ""
 
 
-def _of_this_training(cell: Cell, directory: Path) -> bool:
-    """Whether a run is of the same training, by the code of today."""
+def _of_this_training(cell: Cell, directory: Path, data: Data | None) -> bool:
+    """Whether a run is of the same training, by the code of today and on the same data."""
     other, code = directory / "cell.json", read_json(directory / "code.json")
     if code is None or not other.is_file():
         return False
     same = training_json(load_cell(other)) == training_json(cell)
-    return same and "train" not in store.changed(code, cell)
+    return same and "train" not in store.changed(code, cell, data)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from mtl_bench.bench import store
+from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.jobs import CELLS
 from mtl_bench.bench.stored import load_model, time_again, time_cell
 from mtl_bench.core import provenance
@@ -25,6 +26,7 @@ from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.samples import open_samples
 from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, open_walks, rehearse
 from mtl_bench.model import Model
+from mtl_bench.train import checkpoint
 from mtl_bench.train.curve import data_share, training_time
 from mtl_bench.train.loop import CHECKPOINT, train
 from mtl_bench.train.progress import Interrupted, Progress
@@ -71,17 +73,18 @@ def run_cell(
     code, environment = provenance.code(cell), provenance.environment(compute.device)
     write_json(run_dir / "env.json", environment)
 
-    tasks = tasks_of_cell(cell)
+    data, tasks = Data(root), tasks_of_cell(cell)
     open_walks(cell.recipe, tasks, root)  # what would stop the evaluation is told at once
+    record = data.of(cell)
     if cell.video and not dataset_of(cell.recipe).takes_further_labels:
         raise ValueError(
             f"video trains on labels of further frames, and {cell.recipe.data.dataset} takes no "
             f"further labels; set video=false"
         )
     if cell.single_task:
-        trained = _trained_apart(cell, run_dir, compute)
+        trained = _trained_apart(cell, run_dir, compute, data)
     else:
-        trained = _train(cell, run_dir, root, compute, progress, tracker)
+        trained = _train(cell, run_dir, root, compute, progress, tracker, data)
     model, took = trained.model, trained.time
     echo(f"trained in {took['train_s']:.0f} s ({took['step_ms']:.0f} ms a step)")
 
@@ -99,6 +102,7 @@ def run_cell(
         "protocol": {**evaluation.protocol, **_training_protocol(cell, root), **trained.protocol},
         "time": {**took, "eval_s": eval_s, "latency_s": latency_s},
         "code": code,
+        "data": record,
         "env": environment,
     }
     tracker.log({key: value for key, value in row["metric"].items() if not isinstance(value, str)})
@@ -110,26 +114,31 @@ def run_cell(
 def renew(
     cell: Cell, run_dir: Path, root: Path, device: str = "auto", echo: Callable[[str], None] = print
 ) -> None:
-    """Evaluate and time a trained cell again, as far as its row is of other code; never train.
+    """Evaluate and time a trained cell again, as far as its row is of other code or data; never
+    train.
 
-    A row that an older version stamped is stamped anew where its checkpoint gives back every metric
-    (latency apart), bit for bit. Where it does not, the row is stale for training from then on.
+    A row that an older version stamped, or whose data's files were written anew, is stamped anew
+    where its checkpoint gives back every metric (latency apart), bit for bit. Where it does not,
+    the row is stale for training from then on.
     """
-    row = store.load_row(run_dir)
+    row, data = store.load_row(run_dir), Data(root)
     assert row is not None
-    code, stale = provenance.code(cell), store.changed(row["code"], cell)
-    older = provenance.STAMPED_BEFORE in stale.values()
+    code = provenance.code(cell)
+    stale = store.changed({**row["code"], "data": row.get("data")}, cell, data)
+    unsure = store.unsure(stale)
     if "evaluate" in stale:
         if cell.single_task:
             for parent in cell.parents:
-                _result_of(parent, run_dir.parent)
+                _result_of(parent, run_dir.parent, data)
         compute = Compute(choose_device(device), cell.recipe.optim.precision)
+        if not cell.single_task:
+            checkpoint.require(run_dir / CHECKPOINT, cell)
         model, progress = load_model(cell, run_dir / CHECKPOINT, compute), Progress(run_dir, echo)
         evaluation, eval_s = _evaluate(model, cell, root, compute, progress)
         timing = {k: v for k, v in row["metric"].items() if k.startswith("latency.")}
         before = {k: v for k, v in row["metric"].items() if k not in timing}
         after = {key: evaluation.metrics.get(key) for key in before}
-        if older and json.dumps(before) != json.dumps(after):  # as text: NaN equals itself
+        if unsure and json.dumps(before) != json.dumps(after):  # as text: NaN equals itself
             different = sum(json.dumps(before[k]) != json.dumps(after[k]) for k in before)
             row["code"] = {stage: {} for stage in code}
             write_json(run_dir / "row.json", row)
@@ -140,13 +149,14 @@ def renew(
             return
         row["metric"] = {**evaluation.metrics, **timing}
         row["protocol"] |= evaluation.protocol
-        if older:
+        if unsure:
             echo("every metric is that of the row, which is stamped anew")
         else:
             row["time"]["eval_s"] = eval_s
             row["env_of_evaluation"] = provenance.environment(compute.device)
             _save_samples(run_dir / "samples.npz", evaluation.samples)
-    again = "time" in stale and not older
+    again = stale.get("time", provenance.STAMPED_BEFORE) != provenance.STAMPED_BEFORE
+    row["data"] = data.of(cell)
     row["code"] = {**code, "time": row["code"]["time"]} if again else code
     write_json(run_dir / "row.json", row)
     if again:
@@ -170,14 +180,23 @@ def _evaluate(
 
 
 def _train(
-    cell: Cell, run_dir: Path, root: Path, compute: Compute, progress: Progress, tracker: Tracker
+    cell: Cell,
+    run_dir: Path,
+    root: Path,
+    compute: Compute,
+    progress: Progress,
+    tracker: Tracker,
+    data: Data,
 ) -> Trained:
-    """Train; a video cell goes on from its parent's checkpoint, with labels that this one made."""
+    """Train, from the parent's checkpoint on where there is one; a video cell also on labels that
+    this one made."""
     taken: dict[str, Any] = read_json(run_dir / TAKEN) or {}
     start = further_labels = None
     protocol = {}
+    for parent in cell.parents:
+        _, start = _result_of(parent, run_dir.parent, data)
     if cell.video:
-        _, start = _result_of(cell.parents[0], run_dir.parent)
+        assert start is not None
         further_labels, frames = _pseudo_labels(
             cell, start, root, run_dir, compute, progress, taken
         )
@@ -227,26 +246,27 @@ def _pseudo_labels(
     return folder, counts[-1]
 
 
-def _trained_apart(cell: Cell, run_dir: Path, compute: Compute) -> Trained:
+def _trained_apart(cell: Cell, run_dir: Path, compute: Compute, data: Data) -> Trained:
     """The networks of a single-task cell's parents, side by side."""
-    times = [_result_of(parent, run_dir.parent)[0]["time"] for parent in cell.parents]
+    times = [_result_of(parent, run_dir.parent, data)[0]["time"] for parent in cell.parents]
     took = {key: sum(time[key] for time in times) for key in ("train_s", "step_ms")}
     took["peak_mib"] = max(time["peak_mib"] for time in times)
     return Trained(load_model(cell, run_dir / CHECKPOINT, compute), took, {})
 
 
-def _result_of(parent: Cell, runs: Path) -> tuple[dict[str, Any], Path]:
+def _result_of(parent: Cell, runs: Path, data: Data) -> tuple[dict[str, Any], Path]:
     """Row and checkpoint of a cell that another needs.
 
     Raises:
-        ValueError: it lacks one of them, or they are of other code.
+        ValueError: it lacks one of them, or they are of other code or data.
     """
-    state = store.stored(parent, runs)
+    state = store.stored(parent, runs, data)
     path = store.run_dir(parent, runs) / CHECKPOINT
     if not state.trained or state.row is None or not path.is_file():
         word = "without its checkpoint" if state.trained else state.word
         why = f" ({state.why})" if state.why else ""
         raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: run that one again")
+    checkpoint.require(path, parent)
     return state.row, path
 
 

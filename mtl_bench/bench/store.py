@@ -2,8 +2,8 @@
 
 runs/<method>-<backbone>-s<seed>-<id>/    of a cell
     cell.json      what to run, whole
-    code.json      fingerprints of the code that began it, by stage: a checkpoint is continued by
-                   no other code for training
+    code.json      fingerprints of the code that began it, by stage, and a record of its data: a
+                   checkpoint is continued by no other code for training and on no other data
     claim          who is running it now
     progress.json  how far that is
     last.pt        checkpoint          curve.csv  losses, weights, rate per step
@@ -21,11 +21,13 @@ runs/latency/                             of timings
 """
 
 import shutil
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_parents
 from mtl_bench.core import provenance
 from mtl_bench.core.config import Cell
@@ -33,6 +35,7 @@ from mtl_bench.core.files import read_json, write_json
 from mtl_bench.core.locks import claimed_by
 from mtl_bench.core.plain import to_dict
 
+SECTIONS = ("metric", "protocol", "time", "code", "data", "env", "cell", "timing")  # of a row
 TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
 ASIDE = "set-aside-"
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
@@ -57,37 +60,68 @@ def run_dir(job: Job, runs: Path) -> Path:
 
 
 def load_row(directory: Path) -> dict[str, Any] | None:
-    row: dict[str, Any] | None = read_json(directory / "row.json")
+    return read_json(directory / "row.json")
+
+
+def read_row(path: Path, job: Job) -> dict[str, Any] | None:
+    """A job's row, where there is one.
+
+    Raises:
+        ValueError: it is damaged, or another job's.
+    """
+    row, kind = read_json(path), kind_of(job)
+    if row is None:
+        return None
+    own = kind.identity(job)
+    for key in row.keys() & kind.owner:
+        if row[key] != own[key]:
+            why = f"its {key} is {row[key]}, not {own[key]}"
+            raise ValueError(f"{path} is another {kind.noun}'s: {why}; delete it to run this one")
+    wrong = [section for section in row.keys() & SECTIONS if not isinstance(row[section], dict)]
+    for section in {"metric", "time"}.difference(wrong):
+        wrong += [key for key, value in row.get(section, {}).items() if not _fits(key, value)]
+    if wrong or not row:
+        why = f"its '{wrong[0]}'" if wrong else "it says nothing"
+        raise ValueError(f"{path} is damaged ({why}); delete it to run its cell again")
     return row
+
+
+def _fits(key: str, value: Any) -> bool:
+    """Metrics and times are numbers; a latency also says on what."""
+    return isinstance(value, (int, float)) or key.startswith("latency.")
 
 
 # --- status ---------------------------------------------------------------------------------------
 
 
-def status(job: Job, runs: Path) -> str:
+def status(job: Job, runs: Path, data: Data | None = None) -> str:
     """Of a cell: done | stale | failed | interrupted | running | missing; of a timing: done | stale
     | wrong | failed | unavailable | missing"""
-    return inspect(job, runs).word
+    return inspect(job, runs, data).word
 
 
-def inspect(job: Job, runs: Path) -> State:
-    """A job's status, why it is that, and its row where there is one."""
+def inspect(job: Job, runs: Path, data: Data | None = None) -> State:
+    """A job's status, why it is that, and its row where there is one.
+
+    Args:
+        data: those that it would run on; a row of others is stale. None: not known.
+    """
     if claimed_by(run_dir(job, runs)) is not None:
         return State("running")
-    return stored(job, runs)
+    return stored(job, runs, data)
 
 
-def stored(job: Job, runs: Path) -> State:
-    """The status that the files give, whoever runs the job at the moment.
-
-    Raises:
-        ValueError: a row that is damaged.
-    """
-    row = read_json(kind_of(job).row_file(job, runs))
-    if row is not None:
-        return state_of(row, job)
+def stored(job: Job, runs: Path, data: Data | None = None) -> State:
+    """The status that the files give, whoever runs the job at the moment; of damaged ones, what is
+    to be done about them."""
     directory = run_dir(job, runs)
-    failure = read_json(directory / "failed.json")
+    try:
+        row = read_row(kind_of(job).row_file(job, runs), job)
+        failure = read_json(directory / "failed.json")
+    except ValueError as error:
+        return State("failed", str(error))
+    if row is not None:
+        return state_of(row, job, data)
     if failure is not None:
         return State("failed", str(failure.get("error", "")))
     if any((directory / name).exists() for name in ("code.json", "progress.json", "last.pt")):
@@ -95,14 +129,14 @@ def stored(job: Job, runs: Path) -> State:
     return State("missing")
 
 
-def state_of(row: dict[str, Any], job: Job) -> State:
+def state_of(row: dict[str, Any], job: Job, data: Data | None = None) -> State:
     """The status of a job that has a row."""
     kind = kind_of(job)
     headline = kind.headline(row.get("metric", {}))
     try:
-        stale = changed(row.get("code", {}), job)
+        stale = changed({**row.get("code", {}), "data": row.get("data")}, job, data)
         changes = provenance.in_words(stale)
-    except ValueError as error:  # a plug-in that has gone, has a double now, or is no Python
+    except ValueError as error:  # a plug-in or a data set that has gone, or is no such thing
         stale, changes = dict.fromkeys(kind.stages, str(error)), str(error)
     word = row.get("status", "done")
     if word != "done":
@@ -110,18 +144,25 @@ def state_of(row: dict[str, Any], job: Job) -> State:
     return State("stale" if stale else "done", changes, row, stale, headline)
 
 
-def changed(before: Mapping[str, Any], job: Job) -> dict[str, str]:
-    """Stage -> what of its code changed since fingerprints were taken; empty for nothing.
+def changed(before: Mapping[str, Any], job: Job, data: Data | None = None) -> dict[str, str]:
+    """Stage -> what of its code or data changed since `before` was taken; empty for nothing.
 
     Raises:
-        ValueError: a plug-in that is not there, or is no Python.
+        ValueError: a plug-in that is not there, or is no Python; data that lack what it needs.
     """
     kind = kind_of(job)
-    return provenance.changes(before, kind.code(job), kind.parts(job))
+    found = provenance.changes(before, kind.code(job), kind.parts(job))
+    if data is not None and isinstance(job, Cell):
+        for stage, why in data.changes(job, before.get("data")).items():
+            found[stage] = why if found.get(stage, why) == why else f"{found[stage]}, {why}"
+    return found
 
 
 def rows(
-    jobs: Iterable[Job], runs: Path, names: Mapping[str, str] = NOTHING
+    jobs: Iterable[Job],
+    runs: Path,
+    names: Mapping[str, str] = NOTHING,
+    data: Data | None = None,
 ) -> list[dict[str, Any]]:
     """One row per job for a report: as stored where there is one, with the status of today.
 
@@ -130,7 +171,7 @@ def rows(
     """
     found = []
     for job in jobs:
-        state, kind = inspect(job, runs), kind_of(job)
+        state, kind = inspect(job, runs, data), kind_of(job)
         named = {"name": names[job.id]} if job.id in names else {}
         today = {"status": state.word, kind.why: state.why}
         found.append({**kind.identity(job), **(state.row or {}), **named, **today})
@@ -138,16 +179,23 @@ def rows(
 
 
 def all_rows(runs: Path) -> list[dict[str, Any]]:
-    """The rows of all finished cells, with the status of today."""
+    """The rows of all finished cells, with the status of today; a damaged one is told."""
     found = []
     for path in sorted(runs.glob("*/row.json")):
-        row = load_row(path.parent) or {}
-        state = state_of(row, load_cell(path.with_name("cell.json")))
+        try:
+            cell = load_cell(path.with_name("cell.json"))
+            row = read_row(path, cell) or {}
+        except ValueError as error:
+            print(f"left out: {error}", file=sys.stderr)
+            continue
+        state = state_of(row, cell)
         found.append({**row, "status": state.word, "error": state.why})
     return found
 
 
-def to_run(jobs: Iterable[Job], runs: Path, rerun: str | None = None) -> list[Job]:
+def to_run(
+    jobs: Iterable[Job], runs: Path, rerun: str | None = None, data: Data | None = None
+) -> list[Job]:
     """The jobs without a result, those asked for again, and before them what they need.
 
     An output that was wrong is tried again once its code has changed.
@@ -162,7 +210,7 @@ def to_run(jobs: Iterable[Job], runs: Path, rerun: str | None = None) -> list[Jo
 
     def wanted(job: Job) -> bool:
         if job.id not in found:
-            state, kind = inspect(job, runs), kind_of(job)
+            state, kind = inspect(job, runs, data), kind_of(job)
             words = {*kind.unfinished, *kind.again.get(rerun or "", ())}
             found[job.id] = state.word in words or bool(state.word == "wrong" and state.stale)
         return found[job.id]
@@ -170,9 +218,9 @@ def to_run(jobs: Iterable[Job], runs: Path, rerun: str | None = None) -> list[Jo
     return [job for job in with_parents(filter(wanted, jobs)) if wanted(job)]
 
 
-def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path) -> str:
+def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None = None) -> str:
     """`done 3   failed 1`, and what to do about some of them."""
-    states = [inspect(job, runs) for job in jobs]
+    states = [inspect(job, runs, data) for job in jobs]
     reasons = "; ".join(sorted({state.why for state in states if state.word == "stale"}))
     hints = {"stale": f" ({reasons}; --rerun stale)", "failed": " (tried again by the next ablate)"}
     hints["wrong"] = " (--rerun failed)"
@@ -194,10 +242,10 @@ def hours_to_run(todo: Sequence[Job], jobs: Iterable[Job], runs: Path) -> float 
 # --- beginning and failing ------------------------------------------------------------------------
 
 
-def done_already(cell: Cell, runs: Path, renew: bool = False) -> str:
+def done_already(cell: Cell, runs: Path, renew: bool = False, data: Data | None = None) -> str:
     """A line that says so, and how to run it again; empty where it is not, or is stale and `renew`
     is said."""
-    state = stored(cell, runs)
+    state = stored(cell, runs, data)
     if state.row is None or (renew and state.word == "stale"):
         return ""
     stale = f", but stale: {state.why}" if state.word == "stale" else ""
@@ -205,8 +253,9 @@ def done_already(cell: Cell, runs: Path, renew: bool = False) -> str:
     return f"done already{stale} ({remedy}): {run_dir(cell, runs) / 'row.json'}"
 
 
-def begin(cell: Cell, runs: Path) -> tuple[Path, str]:
-    """Make a claimed run directory ready; what other code for training had begun is set aside.
+def begin(cell: Cell, runs: Path, data: Data | None = None) -> tuple[Path, str]:
+    """Make a claimed run directory ready; what was begun by other code for training, or on other
+    data, is set aside.
 
     Returns:
         The directory, and a line about an earlier start that is not continued (empty for none).
@@ -216,20 +265,31 @@ def begin(cell: Cell, runs: Path) -> tuple[Path, str]:
     """
     directory = run_dir(cell, runs)
     before, line = read_json(directory / "code.json"), ""
-    if before is not None and "train" in (stale := changed(before, cell)):
+    if before is not None and "train" in (stale := changed(before, cell, data)):
         line = set_aside(directory, stale["train"])
     (directory / "failed.json").unlink(missing_ok=True)
+    for remains in set(directory.glob(".*.tmp")).difference(directory.glob(".cell.json.*")):
+        remains.unlink()  # of a killed run; a launcher that has no claim writes cells
     write_json(directory / "cell.json", to_dict(cell))
-    write_json(directory / "code.json", provenance.code(cell))
+    record = data.of(cell) if data is not None else {}
+    known = {"data": record} if record else {}
+    write_json(directory / "code.json", {**provenance.code(cell), **known})
     return directory, line
 
 
-def can_renew(cell: Cell, runs: Path) -> bool:
+def can_renew(cell: Cell, runs: Path, data: Data | None = None) -> bool:
     """Whether a stale row can be brought up to date, or at least tried, without training."""
-    state = stored(cell, runs)
-    older = provenance.STAMPED_BEFORE in state.stale.values()
+    state = stored(cell, runs, data)
     there = cell.single_task or (run_dir(cell, runs) / "last.pt").is_file()
-    return state.word == "stale" and there and (state.trained or older)
+    return state.word == "stale" and there and (state.trained or unsure(state.stale))
+
+
+def unsure(stale: Mapping[str, str]) -> bool:
+    """Whether the training may be as good as it was, which an evaluation as before tells.
+
+    Not so where the files of training alone were written anew: that one would not see them.
+    """
+    return all(stale.get(stage) in provenance.UNSURE for stage in ("train", "evaluate"))
 
 
 def set_aside(directory: Path, why: str) -> str:

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,12 +88,9 @@ def load_model(cell: Cell, path: Path, compute: Compute) -> Model:
         pairs = zip(cell.parents, paths, strict=True)
         return side_by_side([load_model(parent, file, compute) for parent, file in pairs])
     state = checkpoint.read(path)
-    model = build(cell, compute)[0]
-    try:
-        model.load_state_dict(state["model"])
-    except RuntimeError as error:
-        why = str(error).splitlines()[1].strip()
-        raise ValueError(f"{path} is not of this cell's model: {why}") from None
+    whole = "constants" in state  # then it needs no initial weights, whose file may be elsewhere
+    model = build(replace(cell, pretrained=None) if whole else cell, compute)[0]
+    checkpoint.load(path, state, "model", model)
     return model
 
 

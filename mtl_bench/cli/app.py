@@ -24,7 +24,8 @@ TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
 # Threads that wait for each other give their core back soon: spinning long, one busy process beside
 # a training of two threads made it 80 times slower. Read when torch is loaded.
 SPIN = {"GOMP_SPINCOUNT": "1000", "KMP_BLOCKTIME": "1"}
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # no space, over quota, read-only
+# no space, over quota, over the size of a file, read-only
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 NAMES = (errno.ENAMETOOLONG, errno.ELOOP)  # a path that is none
 USERS = (FileNotFoundError, PermissionError, NotADirectoryError, IsADirectoryError)
 

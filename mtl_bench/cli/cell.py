@@ -1,6 +1,7 @@
 """`train` and `evaluate`: one cell; `score`: what others predicted."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -83,6 +84,17 @@ def train(
     ] = GRANULARITIES[0],
     settings: o.SetOption = None,
     pretrained: o.PretrainedOption = None,
+    continued: Annotated[
+        Path | None,
+        typer.Option(
+            "--continue",
+            metavar="RUN",
+            help="Train that cell's checkpoint on, as a cell of its own: with its recipe, but for "
+            "--set recipe.optim.steps=..., recipe.optim.lr=..., backbone.frozen=all|stem. "
+            "Optimiser and learning rate begin anew.",
+            show_default=False,
+        ),
+    ] = None,
     rerun: Annotated[
         bool, typer.Option("--rerun", help="Forget its earlier result or checkpoint.")
     ] = False,
@@ -120,6 +132,10 @@ def train(
         from mtl_bench.bench.jobs import load_cell
 
         cell = load_cell(cell_file)
+    elif continued is not None:
+        if backbone is not None or method is not None:
+            raise ValueError("--continue takes backbone and method from its RUN: leave them out")
+        cell = _continuing(continued, runs)
     else:
         chosen = load_recipe(recipe)
         backbone = backbone or chosen.backbone
@@ -149,13 +165,15 @@ def train(
         _time_again(cell, data, runs, device.value, quiet)
         return
     from mtl_bench.bench import launch, store
+    from mtl_bench.bench.data_state import Data
 
     check_cells([cell])
-    if not rerun and (line := store.done_already(cell, runs, stale)):
+    there = Data(o.locate(cell, data))
+    if not rerun and (line := store.done_already(cell, runs, stale, there)):
         typer.echo(line)
         return
     root = o.data_root(cell, data, quiet)
-    here = launch.Here(runs, root, device.value, wandb.value, o.echo(quiet))
+    here = launch.Here(runs, root, device.value, wandb.value, o.echo(quiet), there)
     here.run(cell, rerun, stale)
 
 
@@ -179,6 +197,18 @@ def _filmed(cell: Cell, video: Path, given: "Given", quiet: bool) -> tuple[Cell,
 
         root = filmed.tree_of(video, camera, progress=show)
     return set_values(cell, filmed.SETTINGS), root
+
+
+def _continuing(run: Path, runs: Path) -> Cell:
+    """A cell that goes on from a run's, so far with the same recipe."""
+    from mtl_bench.bench import store
+    from mtl_bench.bench.jobs import load_run
+
+    start, checkpoint = load_run(run)
+    expected = store.run_dir(start, runs)
+    if checkpoint.parent.resolve() != expected.resolve():
+        raise ValueError(f"--continue {run} is not '{expected}': say where it is with --runs")
+    return replace(start, continues=start, video=False)
 
 
 def _time_again(cell: Cell, data: Path | None, runs: Path, device: str, quiet: bool) -> None:

@@ -14,8 +14,10 @@ from mtl_bench.cli import options as o
 from mtl_bench.core.config import Cell
 
 if TYPE_CHECKING:
+    from mtl_bench.bench.data_state import Data
     from mtl_bench.bench.grid import Grid
     from mtl_bench.bench.jobs import Job, Timing
+    from mtl_bench.core.recipe import Recipe
 
 
 class Rerun(StrEnum):
@@ -77,9 +79,11 @@ def ablate(
     """Run what a grid still lacks, then write its report.
 
     Cells that are done are reused, interrupted and failed ones tried again; cells that others need
-    run before them, be they in the grid or not. A grid of latencies takes them one at a time.
+    run before them, and the baseline's too, be they in a row or not. A grid of latencies takes them
+    one at a time.
     """
     from mtl_bench.bench import references, store
+    from mtl_bench.bench.data_state import Data
     from mtl_bench.bench.jobs import CELLS
 
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
@@ -88,31 +92,34 @@ def ablate(
         raise ValueError(f"--jobs {jobs}: a latency is taken with nothing else of ours running")
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
-    chosen.kind.check(chosen.jobs)
+    against = references.baselines(chosen)
+    chosen.kind.check([*chosen.jobs, *against])
     if chosen.kind is CELLS:
         from mtl_bench.report import grid as of_cells
 
         of_cells.check(chosen)
-    todo = store.to_run(chosen.jobs, runs, rerun)
+    given = Data(None if data is None else data.resolve())
+    todo = store.to_run([*chosen.jobs, *against], runs, rerun, given)
     for job in [] if dry_run else todo:
         if isinstance(job, Cell):
             o.locate(job, data)  # a wrong folder is told at once
     if not quiet or dry_run:
-        _announce(chosen, todo, runs)
+        _announce(chosen, todo, runs, given)
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
         return
     if todo:
         jobs = jobs or _side_by_side(chosen, todo, device)
-        _run(chosen, todo, runs, data, ["--wandb", wandb.value], device, jobs, rerun, quiet)
+        _run(chosen, todo, runs, data, given, ["--wandb", wandb.value], device, jobs, rerun, quiet)
     if chosen.kind is CELLS:
         references.measure_trivial(
             chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=bool(todo)
         )
-    rows = _rows(chosen, runs)
+    rows = _rows(chosen, runs, given)
     page = _write(chosen, rows, runs, reports, choice.command)
     words = [row["status"] for row in rows]
-    bad = any(word not in chosen.kind.good for word in words)
+    behind = [store.status(cell, runs, given) for cell in against]
+    bad = any(word not in chosen.kind.good for word in [*words, *behind])
     if bad or not quiet:
         done = sum(word in ("done", "stale") for word in words)
         typer.echo(f"{done} of {len(words)} {chosen.kind.noun}s done; report: {page}")
@@ -134,12 +141,13 @@ def status(
 
     Those that are in no row of the grid but needed by one are marked as such.
     """
-    from mtl_bench.bench import store
+    from mtl_bench.bench import references, store
     from mtl_bench.bench.jobs import TIMINGS, with_parents
     from mtl_bench.core.locks import claimed_by
 
     chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
-    own, every = {job.id for job in chosen.jobs}, with_parents(chosen.jobs)
+    own = {job.id for job in chosen.jobs}
+    every = with_parents([*chosen.jobs, *references.baselines(chosen)])
     lines = []
     for job in every:
         state = store.inspect(job, runs)
@@ -264,20 +272,18 @@ class Choice:
         return shlex.join(words)
 
 
-def _announce(grid: "Grid", todo: "Sequence[Job]", runs: Path) -> None:
-    from mtl_bench.bench import store
+def _announce(grid: "Grid", todo: "Sequence[Job]", runs: Path, data: "Data") -> None:
+    from mtl_bench.bench import references, store
     from mtl_bench.bench.jobs import CELLS, with_parents
 
-    every = with_parents(grid.jobs)
+    every = with_parents([*grid.jobs, *references.baselines(grid)])
     counts = {axis: len(values) for axis, values in grid.axes.items()}
     counts |= {"row": len(set(grid.names.values()))} if grid.names else {}
     product = " x ".join(f"{n} {a}{'s' * (n > 1 and a[-1] != 's')}" for a, n in counts.items())
     if grid.kind is CELLS:
-        recipe: Any = grid.recipe
-        size, needed = recipe.data, len(every) - len(grid.jobs)
+        needed = len(every) - len(grid.jobs)
         more = f" and {needed} that they need" if needed else ""
-        steps = f"{size.dataset}, {size.height}x{size.width}, {recipe.optim.steps} steps"
-        about = f"recipe {recipe.name} ({steps})"
+        about = " or ".join(dict.fromkeys(_told(job.recipe) for job in grid.jobs))
     else:
         first = grid.jobs[0]
         more = f" of {first.passes} passes on {first.device}"
@@ -289,9 +295,15 @@ def _announce(grid: "Grid", todo: "Sequence[Job]", runs: Path) -> None:
     )
     hours = store.hours_to_run(todo, every, runs)
     about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
-    typer.echo(f"  {store.summary(grid.kind, every, runs)}   to run {len(todo)}{about}")
+    typer.echo(f"  {store.summary(grid.kind, every, runs, data)}   to run {len(todo)}{about}")
     for line in _skipped(grid):
         typer.echo(line)
+
+
+def _told(recipe: "Recipe") -> str:
+    data = recipe.data
+    size = f"{data.dataset}, {data.height}x{data.width}, {recipe.optim.steps} steps"
+    return f"recipe {recipe.name} ({size})"
 
 
 def _skipped(grid: "Grid") -> list[str]:
@@ -320,6 +332,7 @@ def _run(
     todo: "Sequence[Job]",
     runs: Path,
     data: Path | None,
+    given: "Data",
     options: list[str],
     device: o.Device,
     jobs: int,
@@ -344,15 +357,17 @@ def _run(
     command = of_cell if grid.kind is kinds.CELLS else of_timing
     bars = grid.kind is kinds.CELLS  # which would draw while something is timed
     with display.choose(len(todo), quiet, bars) as shown:
-        launcher = Launcher(runs, command, shown, jobs, rerun, grid.names, smoke=grid.smoke)
+        launcher = Launcher(
+            runs, command, shown, jobs, rerun, grid.names, smoke=grid.smoke, data=given
+        )
         launcher.run(todo)
 
 
-def _rows(grid: "Grid", runs: Path) -> list[dict[str, Any]]:
+def _rows(grid: "Grid", runs: Path, data: "Data | None" = None) -> list[dict[str, Any]]:
     """One row a job; of cells with their deltas to the stored row of their baseline."""
     from mtl_bench.bench import references, store
 
-    rows = store.rows(grid.jobs, runs, grid.names)
+    rows = store.rows(grid.jobs, runs, grid.names, data)
     if not grid.baseline:
         return rows
     from mtl_bench.report.delta import with_delta

@@ -1,9 +1,11 @@
 """What a backbone is: an image in, a feature pyramid out, keyed by stride; or one vector."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar
 
 import timm
+import torch
 from torch import Tensor, nn
 
 from mtl_bench.core import plugins
@@ -34,10 +36,15 @@ class Backbone(nn.Module):
     channels: dict[int, int]  # stride -> channels
     offered: ClassVar[tuple[int, ...]] = (2, 4, 8, 16, 32)  # strides of what it can give
     divisor: ClassVar[int] = 1  # of height and width, where that is more than the deepest stride
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"train": ("stem",)}
 
     def forward(self, image_B3HW: Tensor) -> dict[int, Tensor]:
         """Normalised image -> {stride: features [B, channels[stride], H/stride, W/stride]}."""
         raise NotImplementedError
+
+    def stem(self) -> Iterable[nn.Parameter]:
+        """The parameters before the first stage, for `backbone.frozen=stem`."""
+        raise ValueError(f"{type(self).__name__} names no stem; set backbone.frozen=all")
 
 
 class TimmBackbone(Backbone):
@@ -84,6 +91,16 @@ class TimmBackbone(Backbone):
         features = self.pyramid(image_B3HW)
         found = dict(zip(self._stride_of_level, features, strict=True))
         return {stride: found[stride] for stride in self.channels}
+
+    def stem(self) -> Iterable[nn.Parameter]:
+        """All that the finest level is made of."""
+        training = self.training
+        self.eval()
+        finest = self.pyramid(torch.zeros(1, 3, *2 * [4 * max(self._stride_of_level)]))[0]
+        self.train(training)
+        own = list(self.parameters())
+        found = torch.autograd.grad(finest.sum(), own, allow_unused=True)
+        return [p for p, gradient in zip(own, found, strict=True) if gradient is not None]
 
 
 def divisor_of(cell: Cell) -> int:

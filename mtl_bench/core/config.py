@@ -54,6 +54,8 @@ __all__ += ["did_you_mean", "from_dict", "recipe_names", "set_values", "to_dict"
 PROTOCOL = 2  # raised when numbers made before stop being comparable with numbers made after
 RECIPES = Path(__file__).parents[1] / "bench" / "recipes"
 GRANULARITIES = ("terms", "tasks")
+FROZEN = "frozen"  # a setting of every backbone: "stem" or "all" of it does not learn
+HASHED = "sha256:"  # before the hash of initial weights whose file is elsewhere
 # Values that recipes have had since protocol 2 began. One that is its default is left out of the
 # canonical JSON, so that cells which were run before keep their ids.
 LATER: tuple[tuple[str, str], ...] = (  # section, key
@@ -85,9 +87,10 @@ NOT_SET = {
 class Cell(Checked):
     """One training run and its evaluation.
 
-    Two kinds of cell need others (their `parents`) first: `video` trains its parent's checkpoint
-    on, with pseudo labels from it; `single_task` trains nothing, and evaluates and times the
-    networks of its parents together.
+    Three kinds of cell need others (their `parents`) first: `video` trains its parent's checkpoint
+    on, with pseudo labels from it; `continues` trains another cell's checkpoint on, by a recipe of
+    its own; `single_task` trains nothing, and evaluates and times the networks of its parents
+    together.
 
     Raises:
         ValueError: a value that its field cannot have, or options that exclude each other.
@@ -110,6 +113,7 @@ class Cell(Checked):
     ] = None
     method_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     backbone_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    continues: "Cell | None" = None  # whose model and method it goes on from; optimiser anew
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,13 +128,40 @@ class Cell(Checked):
             )
         if self.single_task and len(self.tasks) < 2:
             raise ValueError(f"single_task needs two tasks or more, not {list(self.tasks)}")
+        if self.continues is not None:
+            self._check_continued(self.continues)
+
+    def _check_continued(self, start: "Cell") -> None:
+        """Raises: ValueError: its checkpoint has no place in this cell's network and method."""
+        if self.single_task or start.single_task:
+            raise ValueError("single_task cells have no one network to continue")
+        own, other = self._kept, start._kept
+        different = [key for key in own if own[key] != other[key]]
+        if different:
+            raise ValueError(
+                f"a continued cell keeps its {', '.join(own)}: {different[0]} "
+                f"{own[different[0]]} is not {other[different[0]]}, that of {start.slug}"
+            )
+
+    @property
+    def _kept(self) -> dict[str, Any]:
+        """What a cell shares with those that continue it; freezing may differ."""
+        arguments = {key: v for key, v in self.backbone_args.items() if key != FROZEN}
+        return {
+            "tasks": self.tasks,
+            "backbone": (self.backbone, arguments),
+            "method": (self.method, self.granularity),
+            "network": self.recipe.network,
+        }
 
     @property
     def parents(self) -> tuple["Cell", ...]:
         """Cells whose checkpoints this one needs."""
         if self.single_task:
             return tuple(replace(self, single_task=False, tasks=(task,)) for task in self.tasks)
-        return (replace(self, video=False),) if self.video else ()
+        if self.video:
+            return (replace(self, video=False),)
+        return () if self.continues is None else (self.continues,)
 
     @cached_property
     def id(self) -> str:
@@ -148,6 +179,7 @@ class Cell(Checked):
         words = [self.method, self.backbone, f"s{self.seed}"]
         words += [] if set(self.tasks) == set(self.recipe.tasks) else [",".join(self.tasks)]
         words += ["single-task"] * self.single_task + ["video"] * self.video
+        words += ["continued"] * (self.continues is not None)
         words += [] if self.granularity == "terms" else [f"by {self.granularity}"]
         arguments = [*self.method_args.items(), *self.backbone_args.items()]
         return " ".join([*words, *(f"{key}={value}" for key, value in arguments)])
@@ -197,6 +229,9 @@ def canonical_json(cell: Cell) -> str:
         del values["recipe"]["pseudo"]
     for key in ("cache", "workers"):
         del values["recipe"]["data"][key]
+    values.pop("continues")
+    if cell.continues is not None:
+        values["continues"] = cell.continues.id
     defaults = to_dict(Recipe())
     values["tasks"] = sorted(cell.tasks, reverse=True)  # no order changes a number
     values["recipe"]["data"]["dataset"] = cell.recipe.data.dataset.replace("_", "-")
@@ -204,7 +239,7 @@ def canonical_json(cell: Cell) -> str:
         if values["recipe"][section][key] == defaults[section][key]:
             del values["recipe"][section][key]
     if cell.pretrained not in (None, "timm"):
-        values["pretrained"] = _content_hash(Path(str(cell.pretrained)))
+        values["pretrained"] = _content_hash(str(cell.pretrained))
     return json.dumps({"protocol": PROTOCOL, **values}, sort_keys=True, separators=(",", ":"))
 
 
@@ -219,12 +254,24 @@ def training_json(cell: Cell) -> str:
 
 
 @lru_cache
-def _content_hash(weights: Path) -> str:
+def _content_hash(weights: str) -> str:
     """A weights file counts by what is in it, not by where it is."""
-    if not weights.is_file():
+    if weights.startswith(HASHED):
+        return weights.removeprefix(HASHED)
+    if not Path(weights).is_file():
         raise ValueError(f"no weights file '{weights}'; --pretrained takes 'timm' or a file")
-    with weights.open("rb") as file:
+    with Path(weights).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def to_travel(cell: Cell) -> dict[str, Any]:
+    """A cell's values for another machine: of a weights file its hash, in place of a path."""
+    values: dict[str, Any] = to_dict(cell)
+    if cell.pretrained not in (None, "timm"):
+        values["pretrained"] = HASHED + _content_hash(str(cell.pretrained))
+    if cell.continues is not None:
+        values["continues"] = to_travel(cell.continues)
+    return values
 
 
 # --- recipes and overrides ------------------------------------------------------------------------
@@ -326,7 +373,8 @@ def check_cells(cells: Iterable[Cell]) -> None:
                 continue
             seen.add((kind, name, tuple(values)))
             plugins.path_of(kind, name)
-            known = plugins.arguments(kind, name) if values else {}
+            known = set(plugins.arguments(kind, name)) if values else set()
+            known |= {FROZEN} if kind == "backbones" else set()
             for key in values:
                 if key not in known:
                     word = kind[:-1]

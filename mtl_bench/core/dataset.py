@@ -8,7 +8,7 @@ reads one (`read`). What is random about a training sample is no business of a d
 Shapes: N frames (a frame and its neighbours in time), H x W pixels.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -150,6 +150,8 @@ class Dataset:
             "check",
             "image_files",
             "sources",
+            "paths",
+            "made_from",
             "described",
         ),
     }
@@ -208,6 +210,15 @@ class Dataset:
         raise NotImplementedError
 
     @classmethod
+    def made_from(cls, data: Data, root: Path | None) -> str | None:
+        """Of generated data: what their bytes depend on; None: they are not, or it is not known.
+
+        Args:
+            root: a folder; None: the one that `render` gives.
+        """
+        return None
+
+    @classmethod
     def check(cls, root: Path, deep: bool = False) -> Report:
         """Look over a folder: what it holds and lacks.
 
@@ -240,6 +251,10 @@ class Dataset:
     def sources(self) -> list[Any]:
         """Files that it can hold."""
         return []
+
+    def paths(self) -> Iterable[Path]:
+        """What its samples are made of: files, or folders with all that is in them."""
+        return [self.root]
 
     @property
     def static_from(self) -> str:

@@ -64,15 +64,18 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 
-def read_json(path: Path) -> Any:
-    """None where there is no such file.
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The values of a file of ours; None where there is none.
 
     Raises:
-        ValueError: a file that is no JSON.
+        ValueError: a file that is no JSON, or not of named values.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise ValueError(f"{type(values).__name__} in place of named values")
     except FileNotFoundError:
         return None
     except ValueError as error:
         raise ValueError(f"{path} is damaged ({error}); delete it to run its cell again") from error
+    return values

@@ -34,20 +34,20 @@ class ClaimedError(Exception):
 def claimed_by(directory: Path) -> dict[str, Any] | None:
     """Who is running a job now: {"pid": ..., "machine": ...}; None where nobody is.
 
-    A claim is void ten minutes after it was last renewed; on this machine, also as soon as its
-    process is dead.
+    A claim is void ten minutes after it was last renewed, or where it is of a time that has not
+    come; on this machine, also as soon as its process is dead.
     """
     path = directory / "claim"
     try:
-        age_s = time.time() - path.stat().st_mtime
-        text = path.read_text()
+        age_s = abs(time.time() - path.stat().st_mtime)
+        content = path.read_bytes()
     except FileNotFoundError:
         return None
     try:
-        owner: dict[str, Any] = json.loads(text)
-    except ValueError:  # being written at this moment, or cut off by a crash
+        owner: dict[str, Any] = json.loads(content)
+        dead = owner["machine"] == _machine() and not _alive(owner["pid"])
+    except (ValueError, TypeError, KeyError, OverflowError):  # being written now, or damaged
         return {} if age_s < TOUCH_S else None
-    dead = owner.get("machine") == _machine() and not _alive(owner["pid"])
     return None if dead or age_s > EXPIRES_S else owner
 
 

@@ -16,6 +16,8 @@ from mtl_bench.core.fingerprint import HARNESS, Root, fingerprints, of_package, 
 
 PACKAGE = Path(__file__).resolve().parents[1]
 STAMPED_BEFORE = "stamped by an older version"
+TOUCHED = "its data's files were written anew"  # with the same names and sizes, or settings
+UNSURE = (STAMPED_BEFORE, TOUCHED)  # an evaluation of the checkpoint tells whether it still holds
 NOT_REPRODUCED = "its checkpoint does not give its row's metrics"
 PACKAGES = (
     "mtl-bench",

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mtl_bench.core.dataset import Dataset, DecodedFrame, Kind
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.recipe import Data, Recipe
+from mtl_bench.data import pictures
 
 if TYPE_CHECKING:
     from mtl_bench.core.task import Task
@@ -213,12 +214,9 @@ def _decoded(path: Path) -> NDArray[np.uint8]:
     Raises:
         ValueError: no image there.
     """
-    image: Any = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
-    if image is None:
-        what = "damaged, or no image" if path.is_file() else "missing; unpack img_align_celeba.zip"
-        raise ValueError(f"{path}: {what}")
-    found: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    return found
+    if not path.is_file():
+        raise ValueError(f"{path}: missing; unpack img_align_celeba.zip")
+    return pictures.read(path)
 
 
 # --- check ----------------------------------------------------------------------------------------

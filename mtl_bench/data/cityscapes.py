@@ -4,7 +4,7 @@ Frames larger than the recipe's input are shrunk to it, intrinsics and labels wi
 reading, or once where `mtl-bench data cache` wrote them down.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -133,6 +133,19 @@ class Cityscapes(Dataset):
         labels = [self._label_files[name] for name in self.names if name in self._label_files]
         sources = [(path, frame_cache.IMAGE) for path in images]
         return sources + [(path, frame_cache.LABELS) for path in labels if self.training]
+
+    def paths(self) -> Iterator[Path]:
+        """The files of its frames, and their cameras'."""
+        yield from (path for path, _ in self.sources())
+        cameras = (self._file(CAMERA, name) for name in set(self._camera_names.values()))
+        yield from (path for path in cameras if self.needs_camera or path.is_file())
+        if not self.training:
+            labelled = self._label_files.keys() & set(self.names)
+            yield from (self._label_files[name] for name in labelled)
+        if "depth_m" in self.needs:
+            yield from (self._file(DISPARITY, name) for name in self.names)
+        if self._ego_mask is not None:
+            yield self.root / files.EGO_MASK.suffix
 
     # --- decoding ---------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ keeps the shape and pads to 384 x 1280 instead). Ground truth stays at the frame
 """
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -175,6 +175,16 @@ class Kitti(Dataset):
             (path, frame_cache.LABELS) for path in self._label_files.values() if self.training
         ]
         return sources + labels
+
+    def paths(self) -> Iterator[Path]:
+        """The files of its frames, their truth's and their days' calibration."""
+        yield from (path for path, _ in self.sources())
+        for date in {frame.date for frame in self._frames.values()}:
+            yield from (self.root / date).glob("calib_*.txt")
+        yield from () if self.training else self._label_files.values()
+        if "depth_m" in self.needs:
+            of = {"improved": self.tree.improved, "velodyne": self.tree.scan}
+            yield from (of[self._truth[frame]](frame) for frame in self._frames.values())
 
     # --- which frames -----------------------------------------------------------------------------
 

@@ -16,6 +16,12 @@ class Synthetic(Cityscapes):
     built_in: ClassVar[bool] = True
 
     @classmethod
+    def made_from(cls, data: Data, root: Path | None) -> str | None:
+        from mtl_bench.data import scenes
+
+        return scenes.made_from(data, root, cls.layout)
+
+    @classmethod
     def render(cls, data: Data, quiet: bool = False) -> Path:
         from mtl_bench.data import scenes
 

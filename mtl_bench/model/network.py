@@ -6,7 +6,7 @@ Shapes: B images, C channels, H x W input pixels, h x w cells of the finest stri
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from mtl_bench.core import config, plugins
 from mtl_bench.core.backbone import VECTOR, Backbone, divisor_of
 from mtl_bench.core.batch import Batch
+from mtl_bench.core.config import FROZEN
+from mtl_bench.core.plain import did_you_mean
 from mtl_bench.core.task import Maps, Task, TaskHead
 from mtl_bench.model.layers import MGNET, Decoder, GlobalContext, Normalize, init_fan_in
 
@@ -29,6 +31,8 @@ class Outputs:
 
 class Network(nn.Module):
     """What runs at inference. In training mode it also predicts what only losses read."""
+
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"train": ("freeze", "train")}
 
     def __init__(self, backbone: Backbone, sizes: config.Network, tasks: Sequence[Task]):
         super().__init__()
@@ -62,6 +66,27 @@ class Network(nn.Module):
                     )
                 ours.update(dict(own.items()))
             self._parts[task.name] = part
+
+    def freeze(self, what: str) -> None:
+        """Let the backbone's stem, or all of the backbone, learn no more.
+
+        Raises:
+            ValueError: neither of them, or a backbone that names no stem.
+        """
+        known = {"stem": self.backbone.stem, "all": self.backbone.parameters}
+        if what not in known:
+            raise ValueError(f"backbone.{FROZEN} is not '{what}'{did_you_mean(what, known)}")
+        for parameter in known[what]():
+            parameter.requires_grad_(False)
+
+    def train(self, mode: bool = True) -> Self:
+        """Statistics of what is frozen stay as they are, too."""
+        super().train(mode)
+        for module in self.backbone.modules():
+            own = list(module.parameters(recurse=False))
+            if own and not any(parameter.requires_grad for parameter in own):
+                module.eval()
+        return self
 
     def keep(self, names: Collection[str]) -> None:
         """Drop the decoders and heads of other tasks."""
@@ -199,11 +224,13 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
     """The cell's model with fresh (or, where the cell says so, pre-trained) weights.
 
     Raises:
-        ValueError: an unknown backbone, or an input that the pyramid does not divide.
+        ValueError: an unknown backbone, an input that the pyramid does not divide, or a part to
+            freeze that is none.
     """
     sizes, data, timed = cell.recipe.network, cell.recipe.data, cell.recipe.latency
     kind = plugins.load("backbones", cell.backbone)
     given: dict[str, Any] = {"pretrained": cell.pretrained, **cell.backbone_args}
+    frozen = given.pop(FROZEN, None)
     if kind.vector:
         for task in tasks:
             if task.reads_pyramid:
@@ -228,7 +255,10 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
                 f"input {height}x{width} is not divisible by the deepest stride {divisor}: "
                 f"change {section}.height, {section}.width or network.strides"
             )
-    model = Model(Network(kind(**given), sizes, tasks), tasks)
+    network = Network(kind(**given), sizes, tasks)
+    if frozen is not None:
+        network.freeze(str(frozen))
+    model = Model(network, tasks)
     for task in tasks:
         model.add_extra(task, task.extra(sizes, cell.pretrained == "timm"))
     for module in model.modules():

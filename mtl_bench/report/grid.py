@@ -48,6 +48,7 @@ from mtl_bench.report.table import (
     write,
 )
 from mtl_bench.report.verdicts import Verdicts, forest, judge, notes, section
+from mtl_bench.train.curve import read as read_curve
 
 PUBLISHED = Path(__file__).parent / "literature.toml"
 AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
@@ -515,7 +516,7 @@ def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, 
         runs = {
             group.label: frames
             for group in results.groups
-            if (frames := [pd.read_csv(path) for path in kept(group, runs_root, "curve.csv")])
+            if (frames := list(kept(group, runs_root, "curve.csv", _curve)))
         }
         captions["loss_curves"] = curves.terms(results, runs, "loss", out_dir)
         captions["weight_curves"] = curves.terms(results, runs, "weight", out_dir)
@@ -523,6 +524,11 @@ def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, 
         captions["samples"] = pictures.draw(results, runs_root, out_dir)
         captions["extremes"] = pictures.extremes(results, runs_root, out_dir)
     return captions
+
+
+def _curve(path: Path) -> pd.DataFrame:
+    found: pd.DataFrame = pd.DataFrame(read_curve(path)).apply(pd.to_numeric)
+    return found
 
 
 def _trivial(tasks: Collection[str]) -> str:

@@ -1,7 +1,10 @@
 """Sample predictions: input, truth and what every group predicts, side by side."""
 
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,12 +62,23 @@ class Samples:
 
     @staticmethod
     def load(path: Path, kind: str = "") -> "Samples | None":
-        """The frames at fixed places, or with `extremes.` the worst and best; None: not kept."""
-        with np.load(path, allow_pickle=False) as file:
-            keys = [key for key in file.files if key.rpartition(".")[0] == kind.rstrip(".")]
-            values = {key.removeprefix(kind): file[key] for key in keys}
+        """The frames at fixed places, or with `extremes.` the worst and best; None: not kept.
+
+        Raises:
+            ValueError: a file that is damaged, or no run's.
+        """
+        try:
+            if not zipfile.is_zipfile(path):
+                raise ValueError("no file of arrays")
+            with np.load(path, allow_pickle=False) as file:
+                keys = [key for key in file.files if key.rpartition(".")[0] == kind.rstrip(".")]
+                values = {key.removeprefix(kind): file[key] for key in keys}
+        except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(f"{path} is damaged ({error}); evaluate again or delete it") from error
         if "names" not in values:
             return None
+        if values.get("image", np.empty(0)).ndim != 4:
+            raise ValueError(f"{path} has no images in it; evaluate again or delete it")
         picked = [column.name for column in headlines() if column.name in values]
         return Samples(
             names=[str(name) for name in values.pop("names")],
@@ -140,7 +154,7 @@ def _found(results: "Results", runs_root: Path, kind: str = "") -> list[tuple[st
     """Labels of the groups that kept such frames, with those of the first run that did."""
     found = []
     for group in results.groups:
-        loaded = (Samples.load(path, kind) for path in kept(group, runs_root, "samples.npz"))
+        loaded = kept(group, runs_root, "samples.npz", partial(Samples.load, kind=kind))
         samples = next((samples for samples in loaded if samples is not None), None)
         if samples is not None:
             found.append((group.label, samples))

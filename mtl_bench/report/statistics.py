@@ -2,16 +2,18 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pandas as pd
 
 from mtl_bench.core.columns import Column
 from mtl_bench.report.columns import DELTA, RELATIVE, Row, columns, flatten, measured, text
 
+T = TypeVar("T")
 SMOKE = "smoke: not a result"
 PSEUDO = "recipe.pseudo."  # the video stage's settings: no number of a cell without it
 NOT_NUMBERS = (  # keys of a cell that change no number
@@ -139,10 +141,14 @@ def entry_of(values: Sequence[float]) -> Entry:
     return Entry(float(known.mean()), float(known.std()), int(known.count()))
 
 
-def kept(group: Group, runs_root: Path, name: str) -> list[Path]:
-    """The files of this name that the group's runs have kept."""
-    paths = (runs_root / str(row.get("slug", "")) / name for row in group.rows)
-    return [path for path in paths if path.is_file()]
+def kept(group: Group, runs_root: Path, name: str, load: Callable[[Path], T]) -> Iterator[T]:
+    """What the group's runs have kept in files of this name; a damaged one is told and left out."""
+    for path in (runs_root / str(row.get("slug", "")) / name for row in group.rows):
+        if path.is_file():
+            try:
+                yield load(path)
+            except ValueError as error:
+                print(f"left out of the figures: {error}", file=sys.stderr)
 
 
 # --- parts ----------------------------------------------------------------------------------------

@@ -66,11 +66,10 @@ def train(
         rehearse(model)
     torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
     if path.is_file():
-        state = checkpoint.read(path)
-        step = checkpoint.restore(state, model, method, optimizer, compute.scaler)
+        step = checkpoint.restore(path, cell, model, method, optimizer, compute.scaler)
         progress.say(f"continuing at step {step} of {optim.steps}")
     elif start is not None:
-        checkpoint.restore_weights(checkpoint.read(start), model, method)
+        checkpoint.restore_weights(start, model, method)
 
     samples = open_samples(
         cell.recipe, model.tasks, "train", root, training=True, further_labels=further_labels
@@ -86,7 +85,7 @@ def train(
     def save() -> None:
         check_state(model, method, optimizer, cell.method, step)
         curve.flush()  # first: the rows up to a checkpoint's step must never be missing
-        checkpoint.save(path, step, model, method, optimizer, compute.scaler)
+        checkpoint.save(path, step, model, method, optimizer, compute.scaler, cell)
 
     def forward(part: Batch) -> Pass:
         with compute.autocast():

@@ -168,12 +168,6 @@ def test_cell_file_gives_the_cell_back(cell, tmp_path):
         load_cell(tmp_path / "gone.json")
 
 
-def test_damaged_row_is_an_error_that_names_it(cell, directory, tmp_path):
-    (directory / "row.json").write_text('{"metric":')
-    with pytest.raises(ValueError, match=r"row.json is damaged"):
-        store.status(cell, tmp_path / "runs")
-
-
 def test_rows_of_a_grid_have_todays_status(cell, directory, tmp_path):
     other = Cell(Recipe(), "tiny", "mine", seed=1)
     write_row(directory, cell)

@@ -9,6 +9,6 @@ From a street to files: `rays` (camera, solids, what a ray hits), `surfaces` (ma
 (files), `make` (the set).
 """
 
-from mtl_bench.data.scenes.make import ensure, write
+from mtl_bench.data.scenes.make import ensure, made_from, write
 
-__all__ = ["ensure", "write"]
+__all__ = ["ensure", "made_from", "write"]

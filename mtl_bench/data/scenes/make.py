@@ -22,11 +22,21 @@ from filelock import FileLock
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from mtl_bench.core.files import read_json
 from mtl_bench.core.recipe import Data
 from mtl_bench.data.scenes import arrays, cityscapes, kitti
-from mtl_bench.data.scenes.settings import CITYSCAPES, CITYSCAPES_ARRAYS, KITTI, NYUV2, Settings
+from mtl_bench.data.scenes.settings import (
+    CITYSCAPES,
+    CITYSCAPES_ARRAYS,
+    KITTI,
+    NYUV2,
+    RECORD,
+    Settings,
+    key_of,
+)
 
 _WRITERS = {CITYSCAPES: cityscapes, KITTI: kitti, NYUV2: arrays, CITYSCAPES_ARRAYS: arrays}
+FAILED = "failed"  # in place of a scene's entry: errno, its text, the folder
 _SINGLE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -47,17 +57,7 @@ def ensure(
     Raises:
         ValueError: snippets too short to train on, or sizes or counts that cannot be rendered.
     """
-    needed = 2 * data.stride + 1
-    if data.frames < needed:
-        raise ValueError(
-            f"recipe.data.frames = {data.frames}, but training compares a frame with the one "
-            f"before it and the one after it at a stride of {data.stride}; set {needed} or more"
-        )
-    settings = Settings(
-        data.height, data.width, data.train_scenes, data.val_scenes, data.test_scenes, data.seed,
-        data.frames, _middle(data.frames), _smallest_thing(data.height, data.width),
-        layout=layout,
-    )  # fmt: skip
+    settings = _settings(data, layout)
     root = platformdirs.user_cache_path("mtl-bench") if root is None else Path(root)
     out = root / f"{data.dataset}-{data.height}x{data.width}-{settings.key}"
     if not out.is_dir():
@@ -65,6 +65,30 @@ def ensure(
             if not out.is_dir():  # another process may have been at it while we waited
                 _render(out, settings, None, progress)
     return out
+
+
+def made_from(data: Data, root: Path | None, layout: str) -> str | None:
+    """The key of the settings that a rendered folder has, or (None) that a recipe gives; None where
+    the folder has none."""
+    if root is None:
+        return _settings(data, layout).key
+    values = read_json(root / RECORD)
+    return None if values is None else key_of(values)
+
+
+def _settings(data: Data, layout: str) -> Settings:
+    """Raises: ValueError: snippets too short to train on, or what `Settings` refuses."""
+    needed = 2 * data.stride + 1
+    if data.frames < needed:
+        raise ValueError(
+            f"recipe.data.frames = {data.frames}, but training compares a frame with the one "
+            f"before it and the one after it at a stride of {data.stride}; set {needed} or more"
+        )
+    return Settings(
+        data.height, data.width, data.train_scenes, data.val_scenes, data.test_scenes, data.seed,
+        data.frames, _middle(data.frames), _smallest_thing(data.height, data.width),
+        layout=layout,
+    )  # fmt: skip
 
 
 def write(
@@ -133,16 +157,21 @@ def _render(out: Path, settings: Settings, processes: int | None, progress: bool
         shutil.rmtree(remains, ignore_errors=True)  # their last worker may still be writing
     partial = out.with_name(f"{out.name}.partial-{secrets.token_hex(4)}")
     partial.mkdir(parents=True)
-    render_all(partial, settings, processes, progress)
-    if out.exists():
-        out.rmdir()  # empty, or rmdir refuses
-    partial.rename(out)
+    try:
+        render_all(partial, settings, processes, progress)
+        if out.exists():
+            out.rmdir()  # empty, or rmdir refuses
+        partial.rename(out)
+    except BaseException:  # a full disk, or Ctrl-C
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
 
 
 def render_all(root: Path, settings: Settings, processes: int | None, progress: bool) -> None:
     """Write every scene and the summaries under `root`.
 
     Raises:
+        OSError: a file cannot be written.
         RuntimeError: a worker died; it has written why to stderr.
     """
     total = len(settings.scenes)
@@ -159,11 +188,13 @@ def work() -> None:
     """Main function of a worker: argv is the JSON job that `_children` makes."""
     job = json.loads(sys.argv[1])
     settings = Settings(**job["settings"])
-    for entry in _scenes(Path(job["root"]), settings, job["first"], job["step"]):
-        try:
+    try:
+        for entry in _scenes(Path(job["root"]), settings, job["first"], job["step"]):
             print(json.dumps(entry), flush=True)
-        except BrokenPipeError:  # the parent is gone
-            os._exit(1)
+    except BrokenPipeError:  # the parent is gone
+        os._exit(1)
+    except OSError as error:  # a full disk: the parent says so, once
+        print(json.dumps({FAILED: [error.errno, error.strerror, job["root"]]}), flush=True)
 
 
 def _scenes(root: Path, settings: Settings, first: int, step: int) -> Iterator[dict[str, Any]]:
@@ -192,7 +223,10 @@ def _children(root: Path, settings: Settings, count: int) -> Iterator[dict[str, 
             line = stdout.readline()  # a worker that is ahead waits in its pipe
             if not line:
                 raise RuntimeError("a rendering process failed; its message stands above")
-            yield json.loads(line)
+            entry = json.loads(line)
+            if FAILED in entry:
+                raise OSError(*entry[FAILED])
+            yield entry
     finally:
         for child in children:
             child.kill()

@@ -14,6 +14,7 @@ from mtl_bench.data.scenes.render import RENDERER_VERSION
 
 CITYSCAPES, KITTI = "Cityscapes", "KITTI raw"  # layouts of files
 NYUV2, CITYSCAPES_ARRAYS = "NYUv2 arrays", "Cityscapes arrays"
+RECORD = "synthetic.json"  # in a data set's folder: its settings
 SPLITS = ("train", "val", "test")
 
 
@@ -70,11 +71,15 @@ class Settings:
 
     @property
     def key(self) -> str:
-        return hashlib.sha256(json.dumps(self.values, sort_keys=True).encode()).hexdigest()[:12]
+        return key_of(self.values)
 
     def write(self, root: Path) -> None:
         """Leave beside the data set what it was made from."""
-        (root / "synthetic.json").write_text(json.dumps(self.values, indent=4) + "\n")
+        (root / RECORD).write_text(json.dumps(self.values, indent=4) + "\n")
+
+
+def key_of(values: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def write_png(path: Path, image: NDArray[Any]) -> None:
