@@ -7,7 +7,7 @@ products, which no features but learned ones explain, and some noise; the input 
 noise.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
@@ -25,6 +25,9 @@ UNITS = 4  # of a function: two products
 NOISE = 0.1  # share of the variance that nothing explains, so that changes in percent stay small
 OWN = 0.7  # of a function's directions that no other has, against the shared part
 IN_MEMORY = Path(__file__).resolve().parent  # stands for a folder; nothing is read from it
+
+
+Functions = Callable[[NDArray[np.float64], Data], NDArray[np.float64]]
 
 
 class Scales(Dataset):
@@ -60,7 +63,7 @@ class Scales(Dataset):
             raise ValueError(
                 f"{data.dataset} with recipe.data.heads = {data.heads} has no {lacking[0]}"
             )
-        self.pixels_N3HW, functions_NK = _made(type(self), data, split)
+        self.pixels_N3HW, functions_NK = _made(self.functions, data, split)
         scale_K = data.norm_ratio ** np.linspace(-0.5, 0.5, data.heads)
         self.truth_NK = torch.from_numpy((functions_NK * scale_K).astype(np.float32))
         self.names = [f"{split}{number}" for number in range(len(self.truth_NK))]
@@ -99,14 +102,14 @@ def products(directions_KDU: NDArray[np.float64], x_ND: NDArray[np.float64]) -> 
 
 
 @lru_cache(maxsize=4)
-def _made(kind: type[Scales], data: Data, split: str) -> tuple[torch.Tensor, NDArray[np.float64]]:
+def _made(functions: Functions, data: Data, split: str) -> tuple[torch.Tensor, NDArray[np.float64]]:
     """Pixels [N,3,H,W] of a split, and the functions [N,K] of them, of the training split's mean 0
     and variance 1."""
     counts = (data.train_scenes, data.val_scenes, data.test_scenes)
     shape = (sum(counts), 3, data.height, data.width)
     pixels = np.random.default_rng([data.seed, 0]).integers(0, 256, shape, np.uint8)
     x_ND = (pixels.reshape(len(pixels), -1) / 255 - 0.5) * 12**0.5  # of variance 1
-    functions_NK = kind.functions(x_ND, data)
+    functions_NK = functions(x_ND, data)
     training = functions_NK[: counts[0]]
     functions_NK = (functions_NK - training.mean(0)) / training.std(0)
     noise_NK = np.random.default_rng([data.seed, 2]).standard_normal(functions_NK.shape)
