@@ -62,9 +62,7 @@ def test_a_report_of_numbers(tmp_path):
         row for name in ("fixed", "rlw") for row in rows("conflict", tmp_path, f"method={name}")
     ]
     grid = load_grid("methods", recipe="conflict", smoke=True, settings=[*SMALL, "method=fixed"])
-    page = build(
-        replace(grid), found, tmp_path / "report", runs_root=tmp_path / "runs", command="x"
-    )
+    page = build(grid, found, tmp_path / "report", runs_root=tmp_path / "runs", command="x")
     table = (page.parent / "table.md").read_text()
     assert "c3 1 - R2" in table
     assert "c4" not in table
