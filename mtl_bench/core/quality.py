@@ -64,8 +64,9 @@ def agreement() -> tuple[Column, ...]:
 
 def words(key: str, tasks: Collection[str]) -> list[str]:
     """What these tasks' `words` say under a key."""
+    stems = {plugins.stem_and_field(task)[0] for task in tasks}
     found = declared("words").items()
-    return [said[key] for task, said in found if key in said and task in tasks]
+    return [said[key] for task, said in found if key in said and task in stems]
 
 
 def in_turns(several: Iterable[Sequence[T]]) -> list[T]:

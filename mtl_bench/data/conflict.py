@@ -3,7 +3,7 @@
 Source: where capacity is scarce, scalarisation cannot reach all trade-offs (Hu et al., NeurIPS
 2023): a trunk narrower than the number of functions serves some at the cost of others. The
 functions have mean 0, variance 1 and the cosine `recipe.data.cosine` with each other over the
-images; number k is one of them with some noise, scaled from 1/`norm_ratio` to 1. At cosine 1 they
+images; number k is one of them with some noise, scaled as those of `scales` are. At cosine 1 they
 are one function, and nothing conflicts. The trunk's width is `recipe.network.channels`.
 """
 

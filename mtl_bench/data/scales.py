@@ -1,9 +1,10 @@
 """Regressions of one input whose losses differ ten-thousandfold: made, to part methods by scale.
 
 Source: after the toy problem of GradNorm (Chen et al., ICML 2018, section 4): number k is
-sigma_k times a function of its own and one that all share. Departures: the scales are spaced evenly
-on a logarithmic axis, from 1/`norm_ratio` to 1; the functions are sums of products, which no
-features but learned ones explain, and some noise; the input is an image of 8-bit noise.
+sigma_k times a function of its own and one that all share. Departures: the scales are spaced
+evenly on a logarithmic axis about 1, `norm_ratio` from end to end; the functions are sums of
+products, which no features but learned ones explain, and some noise; the input is an image of 8-bit
+noise.
 """
 
 from collections.abc import Collection, Mapping
@@ -23,7 +24,7 @@ SPLITS = ("train", "val", "test")
 UNITS = 4  # of a function: two products
 NOISE = 0.1  # share of the variance that nothing explains, so that changes in percent stay small
 OWN = 0.7  # of a function's directions that no other has, against the shared part
-IN_MEMORY = Path("in memory")  # in place of a folder
+IN_MEMORY = Path(__file__).resolve().parent  # stands for a folder; nothing is read from it
 
 
 class Scales(Dataset):
@@ -60,7 +61,7 @@ class Scales(Dataset):
                 f"{data.dataset} with recipe.data.heads = {data.heads} has no {lacking[0]}"
             )
         self.pixels_N3HW, functions_NK = _made(type(self), data, split)
-        scale_K = data.norm_ratio ** np.linspace(-1, 0, data.heads)
+        scale_K = data.norm_ratio ** np.linspace(-0.5, 0.5, data.heads)
         self.truth_NK = torch.from_numpy((functions_NK * scale_K).astype(np.float32))
         self.names = [f"{split}{number}" for number in range(len(self.truth_NK))]
 
@@ -83,7 +84,7 @@ class Scales(Dataset):
 
     @classmethod
     def recognises(cls, root: Path) -> bool:
-        return root == IN_MEMORY
+        return root.resolve() == IN_MEMORY
 
     @classmethod
     def render(cls, data: Data, quiet: bool = False) -> Path:

@@ -507,7 +507,8 @@ def _states(rows: Iterable[Row]) -> str:
 
 def _every_cell(rows: Sequence[Row]) -> Section | None:
     """Every cell on its own: slug, seed, status, and the numbers that carry the table."""
-    shown = [*(c for c in quality.quality() if c in quality.in_brief()), FPS]
+    brief = [column for column in quality.quality() if column in quality.in_brief()]
+    shown = [*(c for c in brief if any(single(row, c) != NOTHING for row in rows)), FPS]
     lines = []
     for row in rows:
         state = str(row.get("status", "done")) + " (smoke)" * bool(row.get("smoke"))

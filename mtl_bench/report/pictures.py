@@ -86,6 +86,8 @@ def draw(results: "Results", runs_root: Path, out_dir: Path) -> str | None:
     shown = found[:GROUPS]
     images = IMAGES if len(found) == len(shown) else IMAGES_OF_MANY
     lines = _lines([samples for _, samples in shown], images, _labels(results))
+    if not lines:  # what tasks predict are numbers
+        return None
     titles = ["input", "truth", *(label for label, _ in shown)]
     _draw_lines(lines, titles, results.smoke, out_dir, "samples")
     kept = {key for _, samples in found for key in samples.maps}
