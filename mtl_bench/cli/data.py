@@ -14,6 +14,8 @@ from mtl_bench.core import config
 class Layout(StrEnum):
     cityscapes = "cityscapes"
     kitti = "kitti"
+    nyuv2 = "nyuv2"
+    cityscapes_mtan = "cityscapes-mtan"
 
 
 def register(app: typer.Typer) -> None:
@@ -41,11 +43,17 @@ def synthetic(
     layout: Annotated[Layout, typer.Option(help="How the files lie.")] = Layout.cityscapes,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
-    """Render seeded street scenes in Cityscapes' layout or KITTI's."""
+    """Render seeded street scenes in the layout of a data set."""
     height, width = o.size(size)
     from mtl_bench.data import scenes as scene_writer
-    from mtl_bench.data.scenes.settings import CITYSCAPES, KITTI
+    from mtl_bench.data.scenes.settings import CITYSCAPES, CITYSCAPES_ARRAYS, KITTI, NYUV2
 
+    layouts = {
+        Layout.cityscapes: CITYSCAPES,
+        Layout.kitti: KITTI,
+        Layout.nyuv2: NYUV2,
+        Layout.cityscapes_mtan: CITYSCAPES_ARRAYS,
+    }
     scene_writer.write(
         out,
         height,
@@ -56,7 +64,7 @@ def synthetic(
         seed,
         frames=frames,
         progress=not quiet,
-        layout=KITTI if layout is Layout.kitti else CITYSCAPES,
+        layout=layouts[layout],
     )
     typer.echo(str(out))
 

@@ -76,6 +76,8 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
 
 NOT_SET = {
     "recipe.tasks": "a cell has its own, tasks",
+    "recipe.backbone": "a cell has its own, backbone",
+    "continues": "train --continue RUN makes such a cell",
     "recipe.name": "a recipe is called as its file",
     "recipe.about": "it is said in the recipe's file",
     "method_args": "its settings are method.KEY",

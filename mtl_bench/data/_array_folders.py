@@ -75,6 +75,21 @@ class ArrayFolders(Dataset):
                 )
 
     @classmethod
+    def example(cls, root: Path, data: Data) -> bool:
+        from mtl_bench.data import scenes
+
+        scenes.write(
+            root, data.height, data.width, 8, 2, 2, data.seed, progress=False, layout=cls.layout
+        )
+        return True
+
+    @classmethod
+    def render(cls, data: Data, quiet: bool = False) -> Path:
+        from mtl_bench.data import scenes
+
+        return scenes.ensure(data, progress=not quiet, layout=cls.layout)
+
+    @classmethod
     def check(cls, root: Path, deep: bool = False) -> Report:
         from mtl_bench.data.check_arrays import check
 

@@ -116,6 +116,11 @@ class CelebA(Dataset):
             fields={key: value for key, value in fields.items() if key in self.needs},
         )
 
+    def paths(self) -> list[Path]:
+        """Both lists, and the split's images."""
+        lists = [self.root / ATTRIBUTES, self.root / PARTITION]
+        return [*lists, *(self.root / IMAGES / f"{name}.jpg" for name in self.names)]
+
     @classmethod
     def recognises(cls, root: Path) -> bool:
         return (root / ATTRIBUTES).is_file()

@@ -13,7 +13,6 @@ from typing import ClassVar
 
 from mtl_bench.core.dataset import Kind
 from mtl_bench.core.labels import GROUND, NO_SURFACE, Label, LabelSet
-from mtl_bench.core.recipe import Data
 from mtl_bench.data._array_folders import ArrayFolders
 
 # Cityscapes' categories without void, in the order of their ids
@@ -52,12 +51,3 @@ class CityscapesMtan(ArrayFolders):
         train = root / "train"
         labelled = any((train / name).is_dir() for name in ("label", "label_7", "label_19"))
         return (train / "image").is_dir() and labelled and not (train / "normal").is_dir()
-
-    @classmethod
-    def example(cls, root: Path, data: Data) -> bool:
-        from mtl_bench.data import scenes
-
-        scenes.write(
-            root, data.height, data.width, 8, 2, 2, data.seed, progress=False, layout=cls.layout
-        )
-        return True

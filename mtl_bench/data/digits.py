@@ -7,6 +7,7 @@ split, so three fifths of the digits, drawn by the data's seed, make training pa
 each those of validation and test. No digit is in two splits.
 """
 
+import json
 from collections.abc import Collection, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +26,7 @@ SPLITS = ("train", "val", "test")
 SHARES = (0.6, 0.8)  # of the digits: where training ends, and validation
 SIZE = 8  # pixels of a digit
 SHIFT = 4  # pixels between the two, both ways
+MADE_FROM = ("height", "width", "train_scenes", "val_scenes", "test_scenes", "seed")
 IN_MEMORY = Path(__file__).resolve().parent  # stands for a folder; nothing is read from it
 
 
@@ -95,6 +97,15 @@ class Digits(Dataset):
     @classmethod
     def recognises(cls, root: Path) -> bool:
         return root.resolve() == IN_MEMORY
+
+    @classmethod
+    def made_from(cls, data: Data, root: Path | None) -> str:
+        """What the pairs depend on."""
+        return json.dumps([cls.name, *(getattr(data, key) for key in MADE_FROM)])
+
+    def paths(self) -> list[Path]:
+        """No file is read."""
+        return []
 
     @classmethod
     def render(cls, data: Data, quiet: bool = False) -> Path:

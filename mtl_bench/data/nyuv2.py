@@ -11,7 +11,6 @@ from typing import ClassVar
 
 from mtl_bench.core.dataset import Kind
 from mtl_bench.core.labels import GROUND, Label, LabelSet
-from mtl_bench.core.recipe import Data
 from mtl_bench.data._array_folders import ArrayFolders
 
 ROOMS13 = LabelSet(
@@ -60,12 +59,3 @@ class Nyuv2(ArrayFolders):
     @classmethod
     def recognises(cls, root: Path) -> bool:
         return (root / "train" / "image").is_dir() and (root / "train" / "normal").is_dir()
-
-    @classmethod
-    def example(cls, root: Path, data: Data) -> bool:
-        from mtl_bench.data import scenes
-
-        scenes.write(
-            root, data.height, data.width, 8, 2, 2, data.seed, progress=False, layout=cls.layout
-        )
-        return True

@@ -7,6 +7,7 @@ products, which no features but learned ones explain, and some noise; the input 
 noise.
 """
 
+import json
 from collections.abc import Callable, Collection, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -25,7 +26,14 @@ UNITS = 4  # of a function: two products
 NOISE = 0.1  # share of the variance that nothing explains, so that changes in percent stay small
 OWN = 0.7  # of a function's directions that no other has, against the shared part
 Functions = Callable[[NDArray[np.float64], Data], NDArray[np.float64]]
+MADE_FROM = (
+    *("height", "width", "train_scenes", "val_scenes", "test_scenes", "seed"),
+    *("heads", "cosine", "norm_ratio"),
+)
 IN_MEMORY = Path(__file__).resolve().parent  # stands for a folder; nothing is read from it
+
+
+Functions = Callable[[NDArray[np.float64], Data], NDArray[np.float64]]
 
 
 class Scales(Dataset):
@@ -86,6 +94,15 @@ class Scales(Dataset):
     @classmethod
     def recognises(cls, root: Path) -> bool:
         return root.resolve() == IN_MEMORY
+
+    @classmethod
+    def made_from(cls, data: Data, root: Path | None) -> str:
+        """What the numbers depend on."""
+        return json.dumps([cls.name, *(getattr(data, key) for key in MADE_FROM)])
+
+    def paths(self) -> list[Path]:
+        """No file is read."""
+        return []
 
     @classmethod
     def render(cls, data: Data, quiet: bool = False) -> Path:

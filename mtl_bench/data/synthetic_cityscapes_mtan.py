@@ -4,10 +4,8 @@ Source: `scenes/`, rendered into the user's cache by seed and number of the scen
 `synthetic-nyuv2`.
 """
 
-from pathlib import Path
 from typing import ClassVar
 
-from mtl_bench.core.recipe import Data
 from mtl_bench.data.cityscapes_mtan import CityscapesMtan
 
 
@@ -16,9 +14,3 @@ class SyntheticCityscapesMtan(CityscapesMtan):
 
     built_in: ClassVar[bool] = True
     published: ClassVar[dict[str, int]] = {}
-
-    @classmethod
-    def render(cls, data: Data, quiet: bool = False) -> Path:
-        from mtl_bench.data import scenes
-
-        return scenes.ensure(data, progress=not quiet, layout=cls.layout)

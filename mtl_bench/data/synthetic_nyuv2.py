@@ -6,10 +6,8 @@ four times as many train_scenes as val_scenes make the counts true. The folder `
 test scenes.
 """
 
-from pathlib import Path
 from typing import ClassVar
 
-from mtl_bench.core.recipe import Data
 from mtl_bench.data.nyuv2 import Nyuv2
 from mtl_bench.data.scenes.arrays import STREET13
 
@@ -20,9 +18,3 @@ class SyntheticNyuv2(Nyuv2):
     labels = STREET13
     built_in: ClassVar[bool] = True
     published: ClassVar[dict[str, int]] = {}
-
-    @classmethod
-    def render(cls, data: Data, quiet: bool = False) -> Path:
-        from mtl_bench.data import scenes
-
-        return scenes.ensure(data, progress=not quiet, layout=cls.layout)

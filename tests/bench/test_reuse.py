@@ -19,7 +19,7 @@ QUICK = ["recipe.optim.steps=2", "recipe.latency.passes=1", "recipe.latency.warm
 @pytest.fixture
 def here(tmp_path, smoke_root):
     lines = []
-    found = Here(tmp_path / "runs", smoke_root, "cpu", "off", lines.append)
+    found = Here(tmp_path / "runs", smoke_root, "cpu", "off", lines.append, Data(smoke_root))
     return found, lines
 
 

@@ -158,7 +158,7 @@ def test_list_settings_has_every_key_with_type_bounds_default_and_meaning():
         r"recipe.optim.steps +int, >= 1 +60000 +of the optimiser",
         r"recipe.evaluate.nms_kernel +int, >= 1, odd +7 +pixels",
         r"recipe.optim.clip +float or none, > 0, finite +0.01 +total gradient norm",
-        r"recipe.network.strides +list of 3 int, .* +\[8, 16, 32\] +pyramid levels",
+        r"recipe.network.strides +list of int, .* +\[8, 16, 32\] +pyramid levels",
         r"seed +int, >= 0 +0 +of initial weights, data order and method",
         r"method.lr +float +0.025 +famo: of the Adam that moves xi",
         r"method.weights +table of float +\{\} +fixed: replace single ones",
