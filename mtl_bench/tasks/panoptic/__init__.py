@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.columns import Column
 from mtl_bench.core.dataset import LabelFrames
-from mtl_bench.core.labels import IGNORE, LabelSet, class_of_instance_id
+from mtl_bench.core.labels import DIVISOR, IGNORE, LabelSet, class_of_instance_id
 from mtl_bench.core.recipe import Network, Recipe
 from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term, present
@@ -107,6 +107,14 @@ class Panoptic(Task):
         "random": "the number of instances that post-processing finds, and its time, may be "
         "another, and nearly tied logits make equal panoptic pixels say less",
     }
+
+    def __init__(self, recipe: Recipe, labels: LabelSet) -> None:
+        super().__init__(recipe, labels)
+        if not 1 <= recipe.evaluate.top_k < DIVISOR:  # one more would be the next class's
+            raise ValueError(
+                f"recipe.evaluate.top_k = {recipe.evaluate.top_k}: an id holds 1 to {DIVISOR - 1} "
+                f"instances of an image"
+            )
 
     # --- network ----------------------------------------------------------------------------------
 
