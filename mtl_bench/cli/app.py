@@ -36,7 +36,7 @@ class Group(TyperGroup):
         except ClaimedError as error:
             typer.echo(f"mtl-bench: {error}", err=True)
             raise typer.Exit(CLAIMED) from None
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, FloatingPointError) as error:  # the last: training blew up
             if isinstance(error, OSError) and not _is_users(error):
                 raise
             if os.environ.get(TRACEBACK):
