@@ -45,7 +45,7 @@ class Group(TyperGroup):
         except SystemExit as stop:  # commands end by `typer.Exit`
             typer.echo(f"mtl-bench: a plug-in has called sys.exit({stop.code!r})", err=True)
             raise typer.Exit(1) from None
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, FloatingPointError) as error:  # the last: training blew up
             if isinstance(error, OSError) and not _is_users(error):
                 raise
             if os.environ.get(TRACEBACK):

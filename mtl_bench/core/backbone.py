@@ -1,8 +1,9 @@
 """What a backbone is: an image in, a feature pyramid out, keyed by stride; or one vector."""
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import timm
 import torch
@@ -54,6 +55,9 @@ class TimmBackbone(Backbone):
         strides: pyramid levels to return; stages deeper than the last are not built.
         pretrained: None for random weights, "timm" for timm's own (hub or local cache), or the
             path of a .pth or .safetensors file with timm's parameter names.
+
+    Raises:
+        ValueError: the model has no features at these strides, or the weights are not its own.
     """
 
     timm_name: str
@@ -61,34 +65,41 @@ class TimmBackbone(Backbone):
 
     def __init__(self, strides: tuple[int, ...] = (8, 16, 32), pretrained: str | None = None):
         super().__init__()
-        overlay = None
-        if pretrained not in (None, "timm"):
-            if not Path(str(pretrained)).is_file():
-                raise ValueError(
-                    f"no weights file '{pretrained}'; --pretrained takes 'timm' or a file"
-                )
-            overlay = {"file": str(pretrained)}
-        dilated = {} if self.output_stride == 32 else {"output_stride": self.output_stride}
-        deepest = 32 if dilated and max(strides) == self.output_stride else max(strides)
-        levels = tuple(range(deepest.bit_length() - 1))  # stride 2 is level 0
+        name = self.timm_name
+        level_of, options = _levels(name, self.output_stride)
+        lacking = [stride for stride in strides if stride not in level_of]
+        if lacking:
+            raise ValueError(
+                f"timm's {name} has features at the strides {_listed(level_of)}, none at "
+                f"{_listed(lacking)}: set network.strides, or take another model"
+            )
+        if pretrained == "timm" and not timm.is_model_pretrained(name):
+            raise ValueError(f"timm has no weights for {name}: leave out --pretrained")
+        deepest = max(level_of[stride] for stride in strides)
         self.pyramid = timm.create_model(
-            self.timm_name,
-            pretrained=pretrained is not None,
-            pretrained_cfg_overlay=overlay,
+            name,
+            pretrained=pretrained == "timm",
             features_only=True,
-            out_indices=levels,
-            **dilated,
+            out_indices=tuple(sorted(i for i in level_of.values() if i <= deepest)),
+            **options,
         )
+        if pretrained not in (None, "timm"):
+            with torch.random.fork_rng(devices=[]):
+                whole = timm.create_model(name, **options).state_dict()
+            load_weights(self.pyramid, Path(str(pretrained)), whole)
         info = self.pyramid.feature_info
         reductions = dict(zip(info.reduction(), info.channels(), strict=True))
         self.channels = {stride: reductions[stride] for stride in strides}
         self._stride_of_level = info.reduction()
+        self._channels_last = getattr(self.pyramid, "output_fmt", None) == "NHWC"
         config = self.pyramid.default_cfg if pretrained else {}
         self.mean = config.get("mean", Backbone.mean)
         self.std = config.get("std", Backbone.std)
 
     def forward(self, image_B3HW: Tensor) -> dict[int, Tensor]:
         features = self.pyramid(image_B3HW)
+        if self._channels_last:
+            features = [x_BHWC.permute(0, 3, 1, 2) for x_BHWC in features]
         found = dict(zip(self._stride_of_level, features, strict=True))
         return {stride: found[stride] for stride in self.channels}
 
@@ -107,3 +118,106 @@ def divisor_of(cell: Cell) -> int:
     """What the height and width of a cell's images are multiples of."""
     backbone = plugins.load("backbones", cell.backbone)
     return 1 if backbone.vector else int(max(cell.recipe.network.strides[-1], backbone.divisor))
+
+
+@functools.cache
+def _levels(name: str, output_stride: int) -> tuple[dict[int, int], dict[str, Any]]:
+    """Which of a timm model's levels has each stride, the deepest of those that have it, and what
+    its constructor must be told.
+
+    A model tells when it is built; nothing that is drawn here shifts what is drawn after it.
+    """
+    options: dict[str, Any] = {} if output_stride == 32 else {"output_stride": output_stride}
+    any_size = {"strict_img_size": False}  # transformers ask for one size of image unless told
+    with torch.random.fork_rng(devices=[]):
+        try:
+            try:
+                model = timm.create_model(name, features_only=True, **options, **any_size)
+                options |= any_size
+            except TypeError:  # it has no such argument
+                model = timm.create_model(name, features_only=True, **options)
+        except RuntimeError as error:  # no such model, or none with features
+            raise ValueError(f"timm's '{name}': {str(error).splitlines()[0]}") from None
+    info = model.feature_info
+    return dict(zip(info.reduction(), info.out_indices, strict=True)), options
+
+
+def _listed(numbers: Collection[int]) -> str:
+    return ", ".join(str(number) for number in sorted(set(numbers)))
+
+
+# --- weights from a file --------------------------------------------------------------------------
+
+
+def load_weights(module: nn.Module, path: Path, whole: Collection[str] = ()) -> None:
+    """Put a file's weights into a module that is a model or the first stages of one.
+
+    What stands before every name, such as `backbone.` or `module.`, counts for nothing, nor do
+    weights of what else the file's network had.
+
+    Args:
+        whole: names of the whole model's weights: others beside them are of a deeper model.
+
+    Raises:
+        ValueError: no such file, one that holds no weights, or weights of another model.
+    """
+    given = read_weights(path)
+    own = {_flat(name): value for name, value in module.state_dict().items()}
+    needed = [name for name in own if not name.endswith("num_batches_tracked")]
+    before = {name[: -len(end)] for name in given for end in needed if _flat(name).endswith(end)}
+    have = {  # the file's names by ours, for all that may stand before them
+        prefix: {_flat(name[len(prefix) :]): name for name in given if name.startswith(prefix)}
+        for prefix in sorted({"", *before})
+    }
+    lacking = {prefix: [x for x in needed if x not in names] for prefix, names in have.items()}
+    prefix, *others = sorted(have, key=lambda prefix: len(lacking[prefix]))
+    if lacking[prefix]:
+        raise ValueError(
+            f"{path} lacks {len(lacking[prefix])} of the {len(needed)} weights of this model, "
+            f"'{lacking[prefix][0]}' for one: it holds another model's"
+        )
+    if others and not lacking[others[0]]:
+        raise ValueError(f"{path} holds two models, '{prefix}' and '{others[0]}': leave one")
+    known = {_flat(name): name.partition(".")[0] for name in whole}
+    parts = {known[name] for name in needed if name in known}
+    for flat, name in have[prefix].items():
+        part = name[len(prefix) :].partition(".")[0]
+        if flat not in known and part in parts and name.endswith(".weight"):
+            raise ValueError(f"{path} has '{name}', which this model has not: another model's")
+    for flat in needed:
+        name = have[prefix][flat]
+        shape, wanted = tuple(given[name].shape), tuple(own[flat].shape)
+        if shape != wanted:
+            raise ValueError(f"{path}: '{name}' has shape {shape}, not {wanted}: another model's")
+    module.load_state_dict(
+        {
+            name: given[have[prefix][_flat(name)]] if _flat(name) in have[prefix] else value
+            for name, value in module.state_dict().items()
+        }
+    )
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """Tensors by name of a .safetensors file, or of a .pth file of tensors and plain values.
+
+    Raises:
+        ValueError: no such file, or one that holds no weights.
+    """
+    if not path.is_file():
+        raise ValueError(f"no weights file '{path}'; --pretrained takes 'timm' or a file")
+    try:
+        state = timm.models.load_state_dict(str(path), weights_only=True)
+    except Exception:  # a foreign file fails in any way
+        raise ValueError(
+            f"{path} cannot be read as weights: give a .safetensors file, or a .pth file that "
+            f"holds tensors and plain values alone"
+        ) from None
+    found = {str(name): value for name, value in state.items() if torch.is_tensor(value)}
+    if not found:
+        raise ValueError(f"{path} holds no weights")
+    return found
+
+
+def _flat(name: str) -> str:
+    """A weight's name, whether its module stands in a pyramid (stages_0) or not (stages.0)."""
+    return name.replace(".", "_")

@@ -174,6 +174,11 @@ def _looked_at(
     return seen, count, (single.pop() if single else part() for part in parts)
 
 
+def _trained(passed: Pass) -> list[Tensor]:
+    """What decoders read, less what frozen stages gave them."""
+    return [x for x in passed.representation if x.requires_grad]
+
+
 def _names_of(method: Method, step: Step) -> list[str]:
     return [method.terms[index].name for index in step.present.tolist()]
 
@@ -210,7 +215,7 @@ def _by_losses(
         if not mine:
             continue
         if cosines and number == 0:
-            cosine_of = _measured(mine, list(passed.representation), model)
+            cosine_of = _measured(mine, _trained(passed), model)
         grads = [scaled[name] / count[name] for name in mine]
         torch.autograd.backward(list(mine.values()), grads)
     return _weighting(method, mean_losses(seen), step, scaled_K / scale, cosine_of, total)
@@ -376,7 +381,7 @@ class _ByGradients:
         for part in parts:
             passed = part()
             looked_at.append({name: loss.detach() for name, loss in passed.losses.items()})
-            mine, z = gather(passed.losses, self.method.terms), list(passed.representation)
+            mine, z = gather(passed.losses, self.method.terms), _trained(passed)
             del passed  # which holds the losses, too
             count.update(mine.keys())
             gradients.add(z, _through_decoders(mine, z, own, own_of, scale))
@@ -399,7 +404,7 @@ class _ByGradients:
         own_of: dict[str, list[Tensor | None]] = {}
         total: list[Tensor | None] = [None] * len(self.shared)
         for passed in passes:
-            mine, z = gather(passed.losses, self.method.terms), list(passed.representation)
+            mine, z = gather(passed.losses, self.method.terms), _trained(passed)
             mine = {name: loss for name, loss in mine.items() if name in names}
             del passed
             if not mine:

@@ -5,8 +5,10 @@ from functools import partial
 
 import pytest
 import torch
+import typer
 from support.training import curve, run
 
+from mtl_bench.cli.app import Group
 from mtl_bench.core.device import Compute
 from mtl_bench.core.method import GradientMethod, LossMethod
 from mtl_bench.train import checkpoint, loop
@@ -144,3 +146,20 @@ def test_fp16_may_overflow_while_its_scale_can_fall(
     monkeypatch.setattr(loop, "build_method", lambda cell, terms: NaNDirection(terms))
     with pytest.raises(FloatingPointError, match="leaves a gradient of norm nan at step 5"):
         run(cell, smoke_root, tmp_path / "other")
+
+
+def test_training_that_blew_up_is_one_line(capsys):
+    """A user's learning rate is no bug of ours: no traceback."""
+    blown = typer.Typer(cls=Group, pretty_exceptions_enable=False)
+
+    @blown.command()
+    def train():
+        raise FloatingPointError("method 'x' weighs 'y' by nan at step 3")
+
+    @blown.command()
+    def other(): ...
+
+    with pytest.raises(SystemExit) as stop:
+        blown(["train"])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == "mtl-bench: method 'x' weighs 'y' by nan at step 3\n"
