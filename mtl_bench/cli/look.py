@@ -4,14 +4,12 @@ import textwrap
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from mtl_bench.cli import options as o
-
-if TYPE_CHECKING:
-    from mtl_bench.core.plugins import Description
+from mtl_bench.core.plugins import Description
 
 
 class What(StrEnum):
@@ -87,7 +85,7 @@ def _lines(kind: str, verbose: bool) -> list[str]:
     return o.columns([[about.name, broken.get(about.name, about.summary)] for about in described])
 
 
-def _engine(about: "Description") -> list[str]:
+def _engine(about: Description) -> list[str]:
     """Name, precisions, what it is, and what is not installed."""
     from mtl_bench.core.plugins import lack
     from mtl_bench.deploy import engines
@@ -97,7 +95,7 @@ def _engine(about: "Description") -> list[str]:
     return [about.name, facts.text, about.summary + (f" ({lacking})" if lacking else "")]
 
 
-def _whole(about: "Description", details: Sequence[str] = ()) -> list[str]:
+def _whole(about: Description, details: Sequence[str] = ()) -> list[str]:
     lines = [f"  {about.name}  ({about.path})"]
     lines += [f"    BROKEN: {about.error}"] if about.error else []
     lines += [f"    {line}" for line in details]
