@@ -15,9 +15,8 @@ from types import FrameType
 from typing import Any, NoReturn
 
 import typer
-from typer.core import TyperGroup
 
-from mtl_bench.cli import cell, data, deploy, figure, grid, look, predict, pseudo
+from mtl_bench.cli import cell, data, deploy, figure, grid, help, look, predict, pseudo, score
 from mtl_bench.core.locks import CLAIMED, ClaimedError
 
 TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
@@ -30,7 +29,7 @@ NAMES = (errno.ENAMETOOLONG, errno.ELOOP)  # a path that is none
 USERS = (FileNotFoundError, PermissionError, NotADirectoryError, IsADirectoryError)
 
 
-class Group(TyperGroup):
+class Group(help.Group):
     """Turns what a user can cause into one line and an exit code; a bug keeps its traceback."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -54,17 +53,8 @@ class Group(TyperGroup):
             raise typer.Exit(2) from None
 
 
-app = typer.Typer(
-    cls=Group,
-    name="mtl-bench",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Example: mtl-bench ablate --grid backbones",
-)
-for module in (grid, cell, pseudo, predict, figure, deploy, data, look):
+app = help.App(Group, name="mtl-bench", epilog="Example: mtl-bench ablate --grid backbones")
+for module in (grid, cell, score, pseudo, predict, figure, deploy, data, look):
     module.register(app)
 
 

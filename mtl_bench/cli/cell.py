@@ -1,4 +1,4 @@
-"""`train` and `evaluate`: one cell; `score`: what others predicted."""
+"""`train` and `evaluate`: one cell."""
 
 import json
 from dataclasses import replace
@@ -30,18 +30,13 @@ def register(app: typer.Typer) -> None:
     app.command(rich_help_panel=panel, epilog="Example: mtl-bench evaluate runs/NAME --split val")(
         evaluate
     )
-    app.command(
-        rich_help_panel=panel,
-        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
-        epilog="Example: mtl-bench score --panoptic DIR --depth DIR --data DATA",
-    )(score)
 
 
 def train(
     cell_file: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[CELL.JSON]",
+            metavar="CELL.JSON",
             help="A cell that was run before, to run exactly it again; the options below that name "
             "a cell do not apply then.",
             show_default=False,
@@ -256,59 +251,3 @@ def evaluate(
 
     evaluation = reevaluate(cell, checkpoint, root, device.value, split, export)
     typer.echo(json.dumps(evaluation.metrics, indent=1))
-
-
-def score(
-    context: typer.Context,
-    split: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="In place of the recipe's.", show_default=False),
-    ] = None,
-    recipe: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Whose data set and protocols; without it the one called as the data set.",
-            show_default=False,
-        ),
-    ] = None,
-    settings: o.SetOption = None,
-    data: o.DataOption = None,
-    plugins: o.PluginsOption = None,
-) -> None:
-    """Score predictions that were made elsewhere, and print the metrics as JSON.
-
-    --TASK DIR, for each task that has some: a file a frame, named as the frame or its image, such
-    as NAME_instanceIds.png (16 bits), NAME_depth.png (16 bits, 1/256 m) or NAME.npy.
-    """
-    from mtl_bench.core import dataset
-    from mtl_bench.evaluate.score import score as scored
-
-    if recipe is None:
-        found = dataset.dataset_in(data) if data is not None else None
-        recipe = found.name if found is not None else "small"
-    cell = override(Cell(load_recipe(recipe), backbone="", method=""), settings or [])
-    folders = _folders(context.args)
-    root = o.data_root(cell, data)
-    evaluation = scored(cell.recipe, folders, root, split)
-    typer.echo(json.dumps(evaluation.metrics, indent=1))
-
-
-def _folders(words: list[str]) -> dict[str, Path]:
-    """`--TASK DIR` or `--TASK=DIR`, any number of them, by task."""
-    from mtl_bench.core.plugins import files
-
-    parts = [
-        part for word in words for part in (word.split("=", 1) if "--" in word[:2] else [word])
-    ]
-    names, folders = parts[::2], parts[1::2]
-    for name in names:
-        if name.removeprefix("--") not in files("tasks") or not name.startswith("--"):
-            raise ValueError(
-                f"'{name}' is no option and no task with -- before it: see score --help"
-            )
-    if not names or len(names) != len(folders):
-        raise ValueError(
-            "say where predictions are: --TASK DIR, with a task of mtl-bench list tasks"
-        )
-    return {name.removeprefix("--"): Path(f) for name, f in zip(names, folders, strict=True)}

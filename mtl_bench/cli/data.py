@@ -8,6 +8,7 @@ import typer
 
 from mtl_bench.cli import options as o
 from mtl_bench.cli.cache import cache
+from mtl_bench.cli.help import App
 from mtl_bench.core import config
 
 
@@ -19,7 +20,7 @@ class Layout(StrEnum):
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+    group = App()
     group.command(epilog="Example: mtl-bench data synthetic --out scenes --size 128x256")(synthetic)
     group.command(epilog="Example: mtl-bench data check scenes --deep")(check)
     group.command(epilog="Example: mtl-bench data cache --recipe cityscapes --data DIR")(cache)

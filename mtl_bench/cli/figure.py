@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mtl_bench.cli import options as o
+from mtl_bench.cli.help import App
 
 if TYPE_CHECKING:
     from mtl_bench.show.figures import Shown
@@ -42,7 +43,7 @@ DpiOption = Annotated[int, typer.Option("--dpi", help="Pixels an inch; the width
 
 
 def register(app: typer.Typer) -> None:
-    group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+    group = App()
     group.command(epilog="Example: mtl-bench figure prediction --checkpoint runs/NAME --out a.pdf")(
         prediction
     )

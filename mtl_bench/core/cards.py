@@ -14,8 +14,8 @@ from urllib.parse import quote
 
 from mtl_bench.core import plugins
 from mtl_bench.core.fingerprint import forget_edited
-from mtl_bench.core.plain import in_markdown
 from mtl_bench.core.plugins import Description
+from mtl_bench.core.text import in_markdown
 
 VENUE = re.compile(r"\b([A-Z][A-Za-z]+) ((?:19|20)\d\d)\b")
 PREPRINT = re.compile(r"\barXiv:(\d{4}\.\d{4,5})")

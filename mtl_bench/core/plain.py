@@ -1,4 +1,4 @@
-"""Frozen dataclasses to plain values and back, names that were nearly right, and text of others.
+"""Frozen dataclasses to plain values and back, and names that were nearly right.
 
 What a field may hold stands in its type: `Annotated[int, least(1), "steps of the optimiser"]`. The
 type, the rules and the words are read here and nowhere else, by what converts values, by what
@@ -7,7 +7,6 @@ checks them and by what lists them.
 
 import dataclasses
 import math
-import re
 import sys
 import typing
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -17,8 +16,6 @@ from types import MappingProxyType, NoneType, UnionType
 from typing import Any
 
 T = typing.TypeVar("T")
-BREAKS = re.compile(r"\s*[\x00-\x1f\x7f-\x9f\u2028\u2029]+\s*")
-MARKUP = re.compile(r"([\\`*$~\[\]|]|(?<!\w)_|_(?!\w))")
 
 
 @dataclass(frozen=True)
@@ -197,14 +194,3 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     if near:
         return f" (did you mean '{near[0]}'?)"
     return f" (known: {', '.join(names)})" if names else ""
-
-
-def in_a_line(text: str) -> str:
-    """Without line breaks and control characters: a name or a message as a table can hold it."""
-    return BREAKS.sub(" ", text).strip()
-
-
-def in_markdown(text: str) -> str:
-    """As it is read, in a line: no markup and no HTML of its own."""
-    escaped = MARKUP.sub(r"\\\1", in_a_line(text))
-    return re.sub(r"&(?=#?\w+;)", "&amp;", escaped).replace("<", "&lt;")

@@ -33,9 +33,6 @@ MADE_FROM = (
 IN_MEMORY = Path(__file__).resolve().parent  # stands for a folder; nothing is read from it
 
 
-Functions = Callable[[NDArray[np.float64], Data], NDArray[np.float64]]
-
-
 class Scales(Dataset):
     """Images whose pixels are numbers, and up to ten numbers to regress."""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from mtl_bench.core import quality
 from mtl_bench.core.columns import FPS, Column
-from mtl_bench.core.plain import in_a_line
+from mtl_bench.core.text import in_a_line
 
 Row = Mapping[str, Any]
 

@@ -11,8 +11,8 @@ from typing import Any
 from markupsafe import Markup
 
 from mtl_bench.core.columns import FPS, Column
-from mtl_bench.core.plain import in_a_line
 from mtl_bench.core.quality import agreement, words
+from mtl_bench.core.text import in_a_line
 from mtl_bench.report import latency_plots, protocol
 from mtl_bench.report.columns import Row, against, different, headlines, measured, text
 from mtl_bench.report.grid import published

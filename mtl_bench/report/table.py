@@ -13,7 +13,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from mtl_bench.core.columns import Column
-from mtl_bench.core.plain import in_a_line, in_markdown
+from mtl_bench.core.text import in_a_line, in_markdown
 from mtl_bench.report.columns import Row, capital, measured
 from mtl_bench.report.statistics import Entry
 

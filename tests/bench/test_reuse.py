@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from mtl_bench.bench import store
+from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.launch import Here
 from mtl_bench.core.config import load_recipe, override, training_json
 from mtl_bench.data import scenes

@@ -15,6 +15,7 @@ from mtl_bench.core.task import finish
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.deploy import export
 from mtl_bench.deploy.agreement import equal_share
+from mtl_bench.deploy.graph import strided
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -118,6 +119,18 @@ def described(path, files):
     assert about["classes"][1] == {"index": 1, "name": "road", "label_id": 7, "thing": False}
 
 
+def test_the_graph_may_have_a_free_height_and_width():
+    net = model("tiny").net
+    graph = strided(net, (1, *SIZE), multiple=32)
+    for size in ((32, 96), (160, 64)):
+        image = images(1, size)[0]
+        with torch.no_grad():
+            inverse = export.FullSize(graph, None)(image)[-1]
+            own = net(image.permute(0, 3, 1, 2).float() / 255).maps["depth"]["inverse"]
+        assert torch.allclose(inverse, own, rtol=1e-4)
+
+
+@pytest.mark.slow
 def test_height_and_width_may_be_free(tmp_path):
     path = tmp_path / "net.onnx"
     net = model("tiny").net
