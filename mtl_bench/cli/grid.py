@@ -82,7 +82,7 @@ def ablate(
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
     chosen.kind.check(chosen.jobs)
-    if chosen.kind is CELLS:
+    if chosen.kind is CELLS and not dry_run:  # it imports pandas
         from mtl_bench.report import grid as of_cells
 
         of_cells.check(chosen)

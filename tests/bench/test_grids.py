@@ -257,7 +257,7 @@ def test_parents_come_first_each_once():
         ('method = "n"', 'metod = "n"', r"line 14: 'method' is missing"),
         ("video = true", "vido = true", r"line 16: unknown key 'vido' \(did you mean 'video'"),
         ("video = true", "video = 3", r"line 16: 'video' must be bool, not 3"),
-        ("video = true", "method_args = 3", r"line 16: 'method_args' must be"),
+        ("video = true", "method_args = 3", r"line 16: 'method_args' cannot be set"),
         ("video = true", "seed = 3", r"line 16: 'seed' is an axis"),
         ("video = true", 'recipe = "smal"', r"line 16: no recipe called 'smal'"),
         ("video = true", "recipe.optim.lr = 1", 'line 16: quote a key with dots: "recipe.optim"'),
