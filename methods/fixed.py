@@ -5,6 +5,7 @@ offset 0.01, photometric 1, smoothness 0.001, after Panoptic-DeepLab and Monodep
 "equal" it is equal weighting: the plain sum, which some public code divides by the number of terms.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
@@ -27,7 +28,7 @@ class Fixed(LossMethod):
         weights: replace single ones, by the name of a loss term or task.
 
     Raises:
-        ValueError: an unknown prior or name.
+        ValueError: an unknown prior or name, or a weight below 0.
     """
 
     weight_T: Tensor
@@ -46,6 +47,9 @@ class Fixed(LossMethod):
             known = loss_names()  # of another task: a cell's weights are those of its parts, too
             if name not in known:
                 raise ValueError(f"no loss called '{name}' to weigh{did_you_mean(name, known)}")
+        for name, value in weights.items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"the weight of '{name}' must be >= 0 and finite, not {value}")
         start = {term.name: term.fixed_weight if prior == "paper" else 1.0 for term in terms}
         weight = [float(weights.get(name, start[name])) for name in start]
         self.register_buffer("weight_T", torch.tensor(weight), persistent=False)

@@ -6,19 +6,16 @@ Two such cells have each their row and their id; what they share is a training, 
 
 import shutil
 from pathlib import Path
-
-import torch
+from typing import Any
 
 from mtl_bench.bench import store
 from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.jobs import load_cell
-from mtl_bench.bench.run import TAKEN
 from mtl_bench.core.config import Cell, training_json
 from mtl_bench.core.files import read_json, replacing
-from mtl_bench.train import checkpoint
-from mtl_bench.train.loop import CHECKPOINT
 
-BESIDE = ("curve.csv", TAKEN, "pseudo_labels")  # what a checkpoint's row is made of, too
+CHECKPOINT = "last.pt"
+BESIDE = ("curve.csv", "taken.json", "pseudo_labels")  # what a row is made of, too
 
 
 def adopt(cell: Cell, runs: Path, data: Data | None = None) -> str:
@@ -36,28 +33,33 @@ def adopt(cell: Cell, runs: Path, data: Data | None = None) -> str:
     alike = f"{cell.method}-{cell.backbone}-s{cell.seed}-*/{CHECKPOINT}"
     for path in sorted(runs.glob(alike)):
         try:
-            state = {"step": 0}
-            if _of_this_training(cell, path.parent, data):
-                state = checkpoint.read(path)
+            state = _finished(cell, path, data)
         except ValueError:
             continue  # a damaged cell is told where it is asked for, and hurts no other
-        if state["step"] < cell.recipe.optim.steps:
+        if state is None:
             continue
         for name in BESIDE:
             if (path.parent / name).is_dir():
                 shutil.copytree(path.parent / name, directory / name, dirs_exist_ok=True)
             elif (path.parent / name).exists():
                 shutil.copy(path.parent / name, directory / name)
+        import torch
+
         with replacing(directory / CHECKPOINT) as file:  # last: what is there is whole
             torch.save(state, file)
         return f"trained already, in {path.parent}: only what comes after it is run"
     return ""
 
 
-def _of_this_training(cell: Cell, directory: Path, data: Data | None) -> bool:
-    """Whether a run is of the same training, by the code of today and on the same data."""
-    other, code = directory / "cell.json", read_json(directory / "code.json")
-    if code is None or not other.is_file():
-        return False
-    same = training_json(load_cell(other)) == training_json(cell)
-    return same and "train" not in store.changed(code, cell, data)
+def _finished(cell: Cell, path: Path, data: Data | None) -> dict[str, Any] | None:
+    """The state of a checkpoint at the last step of this cell's training, by the code of today and
+    on the same data."""
+    code = read_json(path.with_name("code.json"))
+    if code is None or training_json(load_cell(path.with_name("cell.json"))) != training_json(cell):
+        return None
+    if "train" in store.changed(code, cell, data):
+        return None
+    from mtl_bench.train import checkpoint  # takes seconds, for torch
+
+    state = checkpoint.read(path)
+    return state if state["step"] >= cell.recipe.optim.steps else None

@@ -11,7 +11,7 @@ import torch
 
 from mtl_bench.bench import store
 from mtl_bench.bench.jobs import load_run
-from mtl_bench.core import provenance
+from mtl_bench.core import plugins, provenance
 from mtl_bench.core.batch import collate
 from mtl_bench.core.config import Cell
 from mtl_bench.core.device import Compute, choose_device
@@ -84,8 +84,10 @@ def load_model(cell: Cell, path: Path, compute: Compute) -> Model:
         ValueError: no readable checkpoint there, or one of another model.
     """
     if cell.single_task:
-        paths = [path.parent.parent / parent.slug / CHECKPOINT for parent in cell.parents]
-        pairs = zip(cell.parents, paths, strict=True)
+        parents = {parent.tasks[0]: parent for parent in cell.parents}
+        ordered = [parents[task] for task in plugins.ordered(parents)]
+        paths = [path.parent.parent / parent.slug / CHECKPOINT for parent in ordered]
+        pairs = zip(ordered, paths, strict=True)
         return side_by_side([load_model(parent, file, compute) for parent, file in pairs])
     state = checkpoint.read(path)
     whole = "constants" in state  # then it needs no initial weights, whose file may be elsewhere

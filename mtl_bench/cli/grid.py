@@ -94,7 +94,7 @@ def ablate(
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
     against = references.baselines(chosen)
     chosen.kind.check([*chosen.jobs, *against])
-    if chosen.kind is CELLS:
+    if chosen.kind is CELLS and not dry_run:  # it imports pandas
         from mtl_bench.report import grid as of_cells
 
         of_cells.check(chosen)

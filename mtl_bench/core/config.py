@@ -119,8 +119,10 @@ class Cell(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.tasks:
-            object.__setattr__(self, "tasks", self.recipe.tasks)
+        # In one order, as none changes a number: the recipe's, then the alphabet's
+        order, own = self.recipe.tasks, set(self.tasks)
+        tasks = (*(task for task in order if task in own), *sorted(own.difference(order)))
+        object.__setattr__(self, "tasks", tasks or order)
         object.__setattr__(self, "method_args", _method_args(self.method, self.method_args))
         arguments = _args("backbones", self.backbone, self.backbone_args, "backbone")
         object.__setattr__(self, "backbone_args", arguments)
@@ -179,7 +181,7 @@ class Cell(Checked):
     def label(self) -> str:
         """What a reader tells cells of one grid apart by, in a few words."""
         words = [self.method, self.backbone, f"s{self.seed}"]
-        words += [] if set(self.tasks) == set(self.recipe.tasks) else [",".join(self.tasks)]
+        words += [] if self.tasks == self.recipe.tasks else [",".join(self.tasks)]
         words += ["single-task"] * self.single_task + ["video"] * self.video
         words += ["continued"] * (self.continues is not None)
         words += [] if self.granularity == "terms" else [f"by {self.granularity}"]
@@ -235,7 +237,7 @@ def canonical_json(cell: Cell) -> str:
     if cell.continues is not None:
         values["continues"] = cell.continues.id
     defaults = to_dict(Recipe())
-    values["tasks"] = sorted(cell.tasks, reverse=True)  # no order changes a number
+    values["tasks"] = sorted(cell.tasks, reverse=True)
     values["recipe"]["data"]["dataset"] = cell.recipe.data.dataset.replace("_", "-")
     for section, key in LATER:
         if values["recipe"][section][key] == defaults[section][key]:

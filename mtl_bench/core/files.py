@@ -50,6 +50,20 @@ def replacing(path: Path, synced: bool = True) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
 
 
+def content(path: Path) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        ValueError: what has this name is no file that can be read, such as a link to nowhere.
+    """
+    if not path.is_file():
+        raise ValueError(f"no file to read: {path}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"no file to read, {error.strerror}: {path}") from None
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     with replacing(path) as file:
         file.write(content)

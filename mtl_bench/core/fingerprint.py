@@ -20,9 +20,10 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import Any
+
+from mtl_bench.core.files import content
 
 STAGES = ("train", "evaluate", "time")
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -44,6 +45,7 @@ NAMED = (
     *(ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef),
     *(ast.ExceptHandler, ast.MatchAs, ast.MatchStar),
 )
+NOT_RUN = ("TYPE_CHECKING", "typing.TYPE_CHECKING", "__name__ == '__main__'")
 DROPPED = {"ctx", "type_comment", "kind", "type_params", "returns", "simple", "type_ignores"}
 
 
@@ -195,29 +197,11 @@ def _definitions(target: Target) -> Iterator[tuple[Path, str]]:
         yield target.path, target.name
     elif target.name in module.imports:
         yield from _definitions(module.imports[target.name])
-    elif (inner := _submodule(target.path, target.name)) is not None:
+    elif (inner := submodule(target.path, target.name)) is not None:
         yield from _definitions(Target(inner))
     else:
         for other in module.stars:
             yield from _definitions(Target(other, target.name))
-
-
-def with_helpers(path: Path) -> list[Path]:
-    """A file and those outside of this package that it imports, directly or through another.
-
-    Raises:
-        ValueError: a file that is no Python.
-    """
-    found, left = {path}, [path]
-    while left:
-        path = left.pop()
-        every = [imported(node, path).values() for node in load(path).importing]
-        targets = [(t.path, t.name) for t in chain.from_iterable(every) if t.path is not None]
-        beside = {file for file, _ in targets} | {_submodule(f, n) for f, n in targets if n}
-        new = {p for p in beside - found if p is not None and p.is_file() and not ours(p)}
-        found |= new
-        left += new
-    return sorted(found)
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -254,22 +238,9 @@ def _module_file(place: Path) -> Path | None:
     return None
 
 
-def _submodule(path: Path, name: str) -> Path | None:
-    return _module_file(path.parent / name) if path.stem == "__init__" else None
-
-
-def content(path: Path) -> bytes:
-    """A file's bytes.
-
-    Raises:
-        ValueError: what has this name is no file that can be read, such as a link to nowhere.
-    """
-    if not path.is_file():
-        raise ValueError(f"no file to read: {path}")
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"no file to read, {error.strerror}: {path}") from None
+def submodule(path: Path, name: str | None) -> Path | None:
+    """The module of this name in a package, whose `__init__.py` this is."""
+    return _module_file(path.parent / name) if name and path.stem == "__init__" else None
 
 
 class Module:
@@ -289,8 +260,7 @@ class Module:
         except (SyntaxError, ValueError) as error:  # ValueError: null bytes
             line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
             raise ValueError(f"{path}{line}: {type(error).__name__}: {error.args[0]}") from None
-        statements = (ast.Import, ast.ImportFrom)
-        self.importing = [node for node in ast.walk(tree) if isinstance(node, statements)]
+        self.tree = tree
         for statement in tree.body:
             self._see(statement)
 
@@ -304,11 +274,7 @@ class Module:
                     self.stars += [base] if base is not None else []
         if isinstance(statement, (ast.Import, ast.ImportFrom)) or _is_text(statement):
             return
-        if isinstance(statement, ast.If) and ast.unparse(statement.test) in (
-            "TYPE_CHECKING",
-            "typing.TYPE_CHECKING",
-            "__name__ == '__main__'",
-        ):
+        if isinstance(statement, ast.If) and ast.unparse(statement.test) in NOT_RUN:
             return
         names = bound(nodes)
         for name in names:
@@ -598,7 +564,7 @@ class _Normal:
                 and not (module and name in module.statements)
                 # a package that imports its own submodule binds it to itself
                 and (not module or module.imports.get(name) in (None, Target(path, name)))
-                and (inner := _submodule(path, name)) is not None
+                and (inner := submodule(path, name)) is not None
             ):
                 target = Target(inner)
             elif module and name in module.imports and module.imports[name].path is None:

@@ -28,7 +28,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mtl_bench.core.fingerprint import ancestry, content, forget_edited, of_package, with_helpers
+from mtl_bench.core.files import content
+from mtl_bench.core.fingerprint import (
+    ancestry,
+    forget_edited,
+    imported,
+    of_package,
+    ours,
+    submodule,
+)
 from mtl_bench.core.fingerprint import load as load_text
 from mtl_bench.core.plain import Rule, did_you_mean
 
@@ -416,9 +424,25 @@ def fingerprint(kind: str, name: str) -> str:
     forget_edited()
     digest = hashlib.sha256()
     for part in part_names(name):
-        for path in with_helpers(path_of(kind, part)):
+        for path in _with_helpers(path_of(kind, part)):
             digest.update(path.read_bytes().replace(b"\r\n", b"\n") + b"\0")
     return digest.hexdigest()[:12]
+
+
+def _with_helpers(path: Path) -> list[Path]:
+    """A file and those outside of this package that it imports, directly or through another."""
+    found, left = {path}, [path]
+    while left:
+        path = left.pop()
+        for node in ast.walk(load_text(path).tree):
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                targets = imported(node, path).values()
+                named = [(t.path, t.name) for t in targets if t.path is not None]
+                files = {file for file, _ in named} | {submodule(*pair) for pair in named}
+                new = {f for f in files - found if f is not None and f.is_file() and not ours(f)}
+                found |= new
+                left += new
+    return sorted(found)
 
 
 class Argument(NamedTuple):

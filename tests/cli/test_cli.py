@@ -387,7 +387,7 @@ def test_train_options_name_a_cell_of_any_kind(train):
     train(*CELL[:-2], "--granularity", "tasks", "--set", "method.weights.panoptic=2.5")
     cell = train.seen[0][0]
     assert (cell.granularity, cell.method_args) == ("tasks", {"weights": {"panoptic": 2.5}})
-    assert "no granularity 'task' (did you mean 'tasks'?)" in one_line(
+    assert "'granularity' must be terms or tasks, not 'task'" in one_line(
         "train", *CELL, "--granularity", "task"
     )
     assert "exclude each other" in one_line("train", *CELL[:-2], "--video", "--single-task")

@@ -96,6 +96,13 @@ def test_a_default_that_is_given_and_the_order_of_tasks_make_no_cell_of_their_ow
     assert override(CELL, settings).id == CELL.id
 
 
+def test_tasks_stand_in_the_recipes_order_then_by_name():
+    assert replace(CELL, tasks=("b", "depth", "a", "panoptic")).tasks == (
+        *("panoptic", "depth", "a", "b"),
+    )
+    assert replace(CELL, tasks=()).tasks == Recipe().tasks
+
+
 def test_infinity_is_a_plug_ins_own_affair():
     nash = override(replace(CELL, method="nash"), ["method.max_norm=inf"])
     assert nash.method_args == {"max_norm": float("inf")}

@@ -14,7 +14,7 @@ from mtl_bench.bench.check.engines import ENGINE_CHECKS
 from mtl_bench.bench.check.methods import METHOD_CHECKS
 from mtl_bench.bench.check.tasks import TASK_CHECKS
 from mtl_bench.core import plugins
-from mtl_bench.core.fingerprint import content
+from mtl_bench.core.files import content
 
 CHECKS: dict[str, Mapping[str, Callable[..., Any]]] = {
     "methods": METHOD_CHECKS,
