@@ -123,14 +123,18 @@ def train(
     Depth also trains on a plain video and its camera, --data VIDEO.mp4 --fx ...: nothing is
     measured then, as there is no truth.
     """
-    if cell_file is not None:
+    if continued is not None:
+        named = {"CELL.JSON": cell_file, "--backbone": backbone, "--method": method}
+        named |= {"--tasks": tasks, "--seed": seed, "--video": video, "--pretrained": pretrained}
+        named |= {"--single-task": single_task, "--recipe": recipe != "small"}
+        named["--granularity"] = granularity != GRANULARITIES[0]
+        for option in (option for option, value in named.items() if value):
+            raise ValueError(f"{option} does not go with --continue, which takes RUN's: use --set")
+        cell = _continuing(continued, runs)
+    elif cell_file is not None:
         from mtl_bench.bench.jobs import load_cell
 
         cell = load_cell(cell_file)
-    elif continued is not None:
-        if backbone is not None or method is not None:
-            raise ValueError("--continue takes backbone and method from its RUN: leave them out")
-        cell = _continuing(continued, runs)
     else:
         chosen = load_recipe(recipe)
         backbone = backbone or chosen.backbone

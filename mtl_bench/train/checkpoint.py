@@ -20,7 +20,7 @@ from mtl_bench.core.files import replacing
 FORMAT = 1
 WHOLE = {  # what training goes on from; to use a model needs no more than "model"
     **{"step": int, "model": dict, "method": dict, "optimizer": dict, "scaler": dict},
-    **{"rng": Tensor, "rng_cuda": list},
+    **{"rng": Tensor, "rng_cuda": list, "cell": dict},
 }
 REMEDY = "put the right file there, or delete it to begin at step 0"
 
@@ -45,10 +45,15 @@ def save(
         "scaler": scaler.state_dict(),
         "rng": torch.get_rng_state(),
         "rng_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "cell": {"id": cell.id, "values": to_travel(cell)},
+        "cell": owner(cell),
     }
     with replacing(path) as file:
         torch.save(state, file)
+
+
+def owner(cell: Cell) -> dict[str, Any]:
+    """What a checkpoint says of its cell: its id, and its values for another machine."""
+    return {"id": cell.id, "values": to_travel(cell)}
 
 
 def read(path: Path, lazily: bool = False) -> dict[str, Any]:
@@ -75,7 +80,7 @@ def read(path: Path, lazily: bool = False) -> dict[str, Any]:
         raise ValueError(f"{path} is not a readable checkpoint: {why}; {REMEDY}") from None
     if not isinstance(state, dict) or state.get("format") != FORMAT:
         raise ValueError(f"{path} is not a checkpoint of format {FORMAT}; {REMEDY}")
-    _require(path, state, "model")
+    _require(path, state, "model", *(["cell"] if "cell" in state else []))
     return state
 
 
@@ -91,14 +96,17 @@ def cell_of(path: Path) -> Cell:
             f"{path} is of an older version, which did not keep its cell in it: put its cell.json "
             f"beside it"
         )
-    return from_dict(Cell, values["values"])
+    try:
+        return from_dict(Cell, values["values"])
+    except (ValueError, TypeError, AttributeError, KeyError) as error:
+        raise ValueError(f"the cell in {path} is none of this version's: {error}") from error
 
 
 def require(path: Path, cell: Cell) -> None:
     """Raises: ValueError: not a checkpoint, or one that another cell has written."""
-    owner = read(path, lazily=True).get("cell", {"id": cell.id})
-    if owner["id"] != cell.id:
-        raise ValueError(f"{path} is of cell {owner['id']}, not of {cell.id}; {REMEDY}")
+    other = read(path, lazily=True).get("cell", {}).get("id", cell.id)
+    if other != cell.id:
+        raise ValueError(f"{path} is of cell {other}, not of {cell.id}; {REMEDY}")
 
 
 def restore(
@@ -116,7 +124,7 @@ def restore(
     """
     require(path, cell)
     state = read(path)
-    _require(path, state, *WHOLE)
+    _require(path, state, *(name for name in WHOLE if name != "cell"))
     load(path, state, "model", model)
     load(path, state, "method", method)
     load(path, state, "optimizer", optimizer)

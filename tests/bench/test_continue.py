@@ -98,8 +98,9 @@ def test_train_continues_a_run(start, smoke_root, tmp_path, monkeypatch):
     assert json.loads(done.stdout).items() <= metric.items()
     text = train("--continue", directory, "--runs", "elsewhere", code=2)
     assert f"--continue {directory} is not 'elsewhere/{first.slug}': say where it is" in text
-    text = train("--continue", directory, "--method", "fixed", code=2)
-    assert "takes backbone and method from its RUN" in text
+    for option in ("--method", "fixed"), ("--seed", "1"), ("--video",), ("--recipe", "smoke"):
+        text = train("--continue", directory, *option, code=2)
+        assert f"{option[0]} does not go with --continue, which takes RUN's" in text
     text = train("--continue", directory, "--set", "backbone.frozen=stm", code=2)
     assert "backbone.frozen is not 'stm' (did you mean 'stem'?)" in text
 

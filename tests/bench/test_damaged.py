@@ -253,6 +253,7 @@ def rewrite(path, **changes):
         (lambda path: rewrite(path, step=None), "it has no 'step'"),
         (lambda path: rewrite(path, step="7"), "it has no 'step'"),
         (lambda path: rewrite(path, rng=[1]), "it has no 'rng'"),
+        (lambda path: rewrite(path, cell=3), "it has no 'cell'"),
         (lambda path: rewrite(path, model={"a": 1}), "not of this cell's model"),
         (lambda path: rewrite(path, optimizer={}), "not of this cell's optimizer"),
         (lambda path: rewrite(path, method={"a": 1}), "not of this cell's method"),
@@ -281,6 +282,10 @@ def test_one_mailed_file_is_enough(saved, tmp_path):
         load_run(mailed.parent)
     rewrite(mailed.with_name("last.pt"), cell=None)  # of an older version
     assert load_run(mailed.with_name("last.pt"))[0].seed == 5
+    rewrite(mailed.with_name("last.pt"), cell={"id": "x", "values": {"recipe": 3}})
+    with pytest.raises(ValueError, match=r"the cell in .*last.pt is none of this version's: "):
+        load_run(mailed.with_name("last.pt"))
+    rewrite(mailed.with_name("last.pt"), cell=None)
     mailed.with_name("cell.json").unlink()
     with pytest.raises(ValueError, match=r"put its cell.json beside it"):
         load_run(mailed.with_name("last.pt"))
