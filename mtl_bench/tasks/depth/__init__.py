@@ -216,7 +216,7 @@ class Depth(Task):
         if size not in (None, tuple(depth_B1HW.shape[2:])):
             maps = self.resized({"inverse": maps["inverse"]}, size)
             depth_B1HW = depth_from_inverse(maps["inverse"].float())
-        depth_m_B1HW = depth_B1HW * scale_B.view(-1, 1, 1, 1)
+        depth_m_B1HW = depth_B1HW * scale_B[:, None, None, None]
         return {"depth": depth_B1HW, "scale": scale_B, "source": source_B, "depth_m": depth_m_B1HW}
 
     def points(self, results: Mapping[str, Results], camera: Camera) -> Tensor:
