@@ -16,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mtl_bench.core import canvas
 from mtl_bench.core.batch import Batch, Camera
-from mtl_bench.core.canvas import LogScale
+from mtl_bench.core.canvas import Image, LogScale
 from mtl_bench.core.columns import Column
 from mtl_bench.core.dataset import Kind, dataset_of
 from mtl_bench.core.labels import LabelSet
@@ -27,7 +28,7 @@ from mtl_bench.core.terms import Term
 from mtl_bench.core.view import Key, View
 from mtl_bench.model.layers import DenseHead, full
 from mtl_bench.tasks.batch_mean import BatchMeans
-from mtl_bench.tasks.depth.picture import TABLE, DepthView
+from mtl_bench.tasks.depth.picture import TABLE, scale_of
 from mtl_bench.tasks.pixels import sampled
 
 ERRORS = ("abs_err", "rel_err")
@@ -100,11 +101,11 @@ class DepthSupervised(Task):
 
     def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> "ValueView":
         found_HW = results[self.name]["supervised"][0].cpu().numpy()
-        return ValueView(_near_bright(found_HW, self.inverse), "")
+        return ValueView(_near_bright(found_HW, self.inverse))
 
     @classmethod
     def drawn_view(cls, name: str, map_HW: NDArray[Any], labels: LabelSet) -> "ValueView":
-        return ValueView(np.asarray(map_HW, np.float32), "")
+        return ValueView(np.asarray(map_HW, np.float32))
 
 
 def field_of(recipe: Recipe) -> tuple[str, Kind]:
@@ -190,12 +191,22 @@ class MeanValue(Trivial):
 
 
 @dataclass(frozen=True)
-class ValueView(DepthView):
+class ValueView(View):
     """Depth up to a factor: every picture has its own scale."""
 
+    depth_HW: NDArray[np.float32]  # 0 = no value
     task = "depth_supervised"
 
-    def files(self, kind: str, image_HW3: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    def picture(self, image_HW3: Image) -> Image:
+        colors = scale_of(self.depth_HW, "").colors
+        return colors(canvas.nearest(self.depth_HW, image_HW3))
+
+    def explained(self, image_HW3: Image, whole: bool = False) -> Image:
+        """The colours, enlarged where the map is tiny."""
+        colors_HW3 = scale_of(self.depth_HW, "").colors(self.depth_HW)
+        return np.asarray(canvas.enlarge(colors_HW3, canvas.factor(image_HW3.shape[1])))
+
+    def files(self, kind: str, image_HW3: Image) -> dict[str, NDArray[Any]]:
         """`supervised`, in colours."""
         return {"supervised": self.explained(image_HW3)} if kind == "supervised" else {}
 
