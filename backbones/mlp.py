@@ -1,7 +1,8 @@
 """Fully connected layers over the pixels of a small image: one vector, for made problems.
 
-Not a published network. The last layer is linear, so that `outputs` is how many functions of
-the image the tasks can share: the trunk's capacity.
+Not a published network. The last layer is linear, so that `outputs` is how many functions of the
+image the tasks can share: the trunk's capacity. SiLU leaves no unit dead, by which seeds would
+differ.
 """
 
 from itertools import pairwise
@@ -36,7 +37,7 @@ class MLP(Backbone):
         if pretrained is not None:
             raise ValueError(f"there are no pre-trained weights for this: '{pretrained}'")
         widths = [3 * size[0] * size[1], *[hidden] * layers, outputs]
-        steps = [part for i, o in pairwise(widths) for part in (nn.Linear(i, o), nn.ReLU())]
+        steps = [part for i, o in pairwise(widths) for part in (nn.Linear(i, o), nn.SiLU())]
         self.layers = nn.Sequential(nn.Flatten(), *steps[:-1])
         self.channels = {VECTOR: outputs}
 

@@ -1,4 +1,5 @@
 """Runs jobs, each in a process of its own: GPU memory is freed, and a crash costs one job.
+Those of cells are forked from one that has imported torch, where that is possible.
 
 The command of a cell is always `python -m mtl_bench train runs/X/cell.json ...`, that of a timing
 `python -m mtl_bench latency ...`, here as in a terminal. State is what lies in runs/: a launcher
@@ -25,6 +26,7 @@ from mtl_bench.bench import store
 from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.jobs import Job, Timing, kind_of, with_parents
 from mtl_bench.bench.jobs import lack as lack_of
+from mtl_bench.bench.preloaded import PROGRAM, Forked, can_fork
 from mtl_bench.bench.store import State
 from mtl_bench.core.config import Cell
 from mtl_bench.core.files import read_json, write_json
@@ -62,7 +64,7 @@ class Run(ABC):
     name: str = ""  # the grid's, where it has names
     began: float = field(default_factory=time.monotonic)
     progress: Mapping[str, Any] = field(default_factory=dict)  # of its `progress.json`
-    process: "subprocess.Popen[bytes] | None" = None
+    process: "subprocess.Popen[bytes] | Forked | None" = None
     _stage: tuple[str, int, float] = ("", 0, 0.0)  # name, first step seen, when
 
     @property
@@ -323,15 +325,19 @@ class Launcher:
             return
         command = run.prepare(state, self.rerun)
         self._running.append(run)
-        with run.log.open("ab") as log:
-            run.process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=child_environment(self.jobs),
-                start_new_session=True,  # Ctrl-C reaches it once, through `_stop`
-            )
+        environment = child_environment(self.jobs)
+        if isinstance(run, CellRun) and can_fork(command):
+            run.process = Forked(command[len(PROGRAM) :], run.log, environment)
+        else:
+            with run.log.open("ab") as log:
+                run.process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env=environment,
+                    start_new_session=True,  # Ctrl-C reaches it once, through `_stop`
+                )
         self.display.started(run)
 
     def _reap(self, queue: deque[Run]) -> None:

@@ -1,0 +1,47 @@
+"""Processes that are forked from one that has imported torch, as the launcher uses them."""
+
+import signal
+import sys
+import time
+
+import pytest
+
+from mtl_bench.bench import preloaded
+from mtl_bench.bench.preloaded import PROGRAM, Forked, can_fork
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+
+
+def test_a_command_runs_as_if_it_was_started_anew(tmp_path):
+    log = tmp_path / "log.txt"
+    log.write_text("before\n")
+    right = Forked(["list", "recipes"], log, {"NO_COLOR": "1", "PATH": "/bin"})
+    wrong = Forked(["train", "--recipe", "no-such"], tmp_path / "wrong.txt", {})
+    assert (right.wait(120), wrong.wait(120)) == (0, 2)
+    assert right.poll() == 0
+    assert log.read_text().startswith("before\n")
+    assert "scales" in log.read_text()
+    assert "no recipe called 'no-such'" in (tmp_path / "wrong.txt").read_text()
+    assert "Traceback" not in (tmp_path / "wrong.txt").read_text()
+
+
+def test_it_takes_signals(tmp_path):
+    words = ["train", "--recipe", "scales", "--method", "fixed", "--runs", str(tmp_path / "runs")]
+    process = Forked(words, tmp_path / "log.txt", {})
+    for _ in range(600):
+        if list(tmp_path.glob("runs/*/progress.json")):
+            break
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(120) == 130
+    killed = Forked(words, tmp_path / "log.txt", {})
+    killed.kill()
+    assert killed.wait(120) == -signal.SIGKILL
+
+
+def test_other_programs_and_changed_code_are_not_forked(monkeypatch):
+    command = [*PROGRAM, "train"]
+    assert can_fork(command)
+    assert not can_fork([sys.executable, "fake_cell.py"])
+    monkeypatch.setattr(preloaded, "_stamp", lambda: (0, 0))
+    assert not can_fork(command)
