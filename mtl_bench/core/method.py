@@ -152,6 +152,33 @@ class LookAheadMethod(GradientMethod):
         raise NotImplementedError
 
 
+class Wrapper(GradientMethod):
+    """A gradient method around another: in `a+b`, what `a` makes of the weights of `b`.
+
+    Args:
+        inner: what it is around where nothing is said.
+    """
+
+    def __init__(self, terms: Sequence[Term], inner: GradientMethod, seed: int = 0):
+        super().__init__(terms, seed)
+        self.around(inner)
+
+    def around(self, inner: GradientMethod) -> "Wrapper":
+        """Itself, around another method.
+
+        Raises:
+            ValueError: a method whose answer is more than weights of one batch's gradients.
+        """
+        if inner.needs == "jacobian" or inner.batches != 1:
+            name, other = type(self).__name__, type(inner).__name__
+            raise ValueError(f"{name} goes around methods that weigh one batch, not {other}")
+        self.inner, self.needs, self.weighted_heads = inner, inner.needs, inner.weighted_heads
+        return self
+
+    def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
+        return self.inner.head_weights(weight_K, step)
+
+
 class Composed(Method):
     """A loss-value method first, a gradient method on the losses as it weighs them: `a+b`.
 

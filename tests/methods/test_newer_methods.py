@@ -13,7 +13,9 @@ from support.methods import head_weights, step_of, weights
 from support.terms import TERMS
 
 from mtl_bench.core import plugins
+from mtl_bench.core.method import Composed
 from mtl_bench.core.terms import Term
+from mtl_bench.train.compose import compose
 
 F64 = torch.float64
 
@@ -156,3 +158,66 @@ def test_ldc_counts_losses_from_their_first_value():
 def test_ldc_names_what_it_does_not_know():
     with pytest.raises(ValueError, match="tau 'two' is not one of one, weights"):
         plugins.load("methods", "ldc")(TERMS, tau="two")
+
+
+# --- wrappers -------------------------------------------------------------------------------------
+
+
+def gramians(count, tasks=3):
+    generator = torch.Generator().manual_seed(7)
+    for _ in range(count):
+        J_KP = torch.randn(tasks, 6, generator=generator, dtype=F64)
+        yield J_KP @ J_KP.T
+
+
+def composed(name, tasks=3, **settings):
+    terms = [Term(f"task{i}", "depth", "regression", 1.0) for i in range(tasks)]
+    return compose(name, settings, terms, seed=0)
+
+
+def test_cr_averages_the_weights_of_what_it_is_around():
+    method, plain = composed("cr+ntkmtl", cr={"alpha": 0.75}), make("ntkmtl", 3)
+    step, average = step_of(torch.ones(3, dtype=F64)), None
+    for G_KK in gramians(4):
+        new = plain.weights(G_KK, step)
+        average = new if average is None else 0.75 * average + 0.25 * new
+        torch.testing.assert_close(method.weights(G_KK, step), average)
+    torch.testing.assert_close(method.head_weights(average, step), average)
+
+
+def test_cr_equals_torchjds():
+    theirs = pytest.importorskip("torchjd.aggregation")
+    oracle = theirs.CRMOGMWeighting(theirs.UPGradWeighting(), alpha=0.9)
+    ours = composed("cr+upgrad")
+    for G_KK in gramians(5):
+        weight_K = ours.weights(G_KK, step_of(torch.ones(3, dtype=F64)))
+        torch.testing.assert_close(weight_K, oracle(G_KK), rtol=1e-4, atol=1e-6)
+
+
+def test_cr_keeps_the_weights_of_absent_tasks():
+    method = composed("cr+ntkmtl", cr={"alpha": 0.5})
+    both, one = step_of(losses(1, 1, 1)), step_of(losses(1), torch.tensor([1]))
+    first = method.weights(torch.diag(losses(1, 4, 1)), both)
+    method.weights(torch.diag(losses(9)), one)
+    assert method.weight_T.tolist() == [first[0], (first[1] + 1) / 2, first[2]]
+
+
+def test_a_composition_of_three_is_a_loss_value_method_on_a_wrapped_one():
+    method = composed("uncertainty+cr+nash", cr={"alpha": 0.5}, nash={"every": 3})
+    assert isinstance(method, Composed)
+    assert (type(method.gradient).__name__, method.gradient.alpha) == ("CorrelationReduced", 0.5)
+    assert (method.gradient.inner.every, method.gradient.weighted_heads) == (3, True)
+    assert composed("cr+mgda_ub").needs == "representation"
+    assert composed("cr+cr+mgda").inner.inner.needs == "gramian"
+
+
+@pytest.mark.parametrize("name", ["mgda+cr", "cr+fixed", "fixed+gls", "mgda+nash", "cr+fixed+mgda"])
+def test_parts_in_another_order_are_refused(name):
+    with pytest.raises(ValueError, match="is not a loss-value method"):
+        composed(name)
+
+
+@pytest.mark.parametrize("name", ["cr+modo", "cr+graddrop", "cr+auto_lambda"])
+def test_a_wrapper_refuses_what_answers_with_more_than_weights(name):
+    with pytest.raises(ValueError, match="goes around methods that weigh one batch, not"):
+        composed(name)
