@@ -128,6 +128,8 @@ def _cost(line: Sequence[ast.ClassDef]) -> str:
     values = _declared(line)
     if values.get("needs") == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
+    if _is_a(line, "PerturbedMethod"):
+        return "1F + 1B + K(3F + H + T)"
     if _is_a(line, "CrossMethod"):  # decoders' own parameters only of the third
         return "3F + 2K(H + T) + KH + 1T"
     batches = values["batches"]

@@ -179,6 +179,40 @@ class Wrapper(GradientMethod):
         return self.inner.head_weights(weight_K, step)
 
 
+class PerturbedMethod(Wrapper):
+    """A wrapper that has every loss differentiated at a point of its own, near the present one.
+
+    The method that it is around sees those gradients, and the losses where the point is.
+    """
+
+    def around(self, inner: GradientMethod) -> Wrapper:
+        """Itself, around another method.
+
+        Raises:
+            ValueError: one that wants gradients of anything but what is shared.
+        """
+        if inner.needs == "representation":
+            name, other = type(self).__name__, type(inner).__name__
+            raise ValueError(
+                f"{name} moves shared parameters, and {other} wants no gradients of them"
+            )
+        return super().around(inner)
+
+    def shifts(
+        self,
+        mean: Sequence[Tensor | None],
+        losses_at: Callable[[Sequence[Tensor]], Tensor],
+        step: Step,
+    ) -> list[list[Tensor]]:
+        """How far to move for each of K losses, tensor by tensor of what is shared.
+
+        Args:
+            mean: the gradient of the losses' mean, up to a positive factor.
+            losses_at: takes a shift, returns the losses [K] there.
+        """
+        raise NotImplementedError
+
+
 class Composed(Method):
     """A loss-value method first, a gradient method on the losses as it weighs them: `a+b`.
 

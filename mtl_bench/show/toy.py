@@ -12,7 +12,7 @@ gets the same one.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,7 @@ from mtl_bench.core.method import (
     LookAheadMethod,
     LossMethod,
     Method,
+    PerturbedMethod,
     Step,
 )
 from mtl_bench.core.terms import Term
@@ -131,7 +132,10 @@ def _asked(
         first_2 = _derivatives(method.loss, step)
     seen, method = Step(first_2 * step.loss_K, step.present), getattr(method, "gradient", method)
     assert isinstance(method, GradientMethod)
-    J_22 = _jacobian(here) * first_2[:, None]
+    J_22 = _jacobian(here)
+    if isinstance(method, PerturbedMethod):
+        J_22 = _perturbed(method, here, J_22, step)
+    J_22 = J_22 * first_2[:, None]
     with torch.no_grad():
         if isinstance(method, LookAheadMethod):
             direction_2, _ = method.direction_ahead(J_22, seen, _ahead(here, first_2, lr), lr)
@@ -144,6 +148,19 @@ def _asked(
             direction_2 = weight_2.to(J_22) @ J_22
     x, y = direction_2.tolist()
     return step, (x, y)
+
+
+def _perturbed(
+    method: PerturbedMethod, here: tuple[float, float], J_22: Tensor, step: Step
+) -> Tensor:
+    """Each loss's gradient where the method moves the point for it."""
+
+    def moved(shift: Sequence[Tensor]) -> tuple[float, float]:
+        x, y = shift[0].tolist()
+        return here[0] + x, here[1] + y
+
+    shifts = method.shifts([J_22.sum(0)], lambda shift: _values(moved(shift)), step)
+    return torch.stack([_jacobian(moved(shift))[i] for i, shift in enumerate(shifts)])
 
 
 def _jacobian(here: tuple[float, float]) -> Tensor:

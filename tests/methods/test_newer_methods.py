@@ -12,9 +12,11 @@ import torch
 from support.methods import head_weights, step_of, weights
 from support.terms import TERMS
 
+from mtl_bench.bench.check.methods import LOSSES, Quadratics
 from mtl_bench.core import plugins
 from mtl_bench.core.method import Composed
 from mtl_bench.core.terms import Term
+from mtl_bench.train.backward import backward
 from mtl_bench.train.compose import compose
 
 F64 = torch.float64
@@ -209,6 +211,55 @@ def test_a_composition_of_three_is_a_loss_value_method_on_a_wrapped_one():
     assert (method.gradient.inner.every, method.gradient.weighted_heads) == (3, True)
     assert composed("cr+mgda_ub").needs == "representation"
     assert composed("cr+cr+mgda").inner.inner.needs == "gramian"
+
+
+def test_samo_with_the_mean_alone_takes_all_gradients_one_step_up():
+    method = compose("samo", {"alpha": 1.0, "rho": 0.3}, LOSSES, seed=0)
+    toy, plain = Quadratics(), Quadratics()
+    before, losses_before = toy.shared.detach().clone(), toy.forward().losses
+    weighting = backward(method, [[toy.forward]], toy)
+    assert torch.equal(toy.shared.detach(), before)  # bit by bit back where it was
+    expected = {name: loss.item() for name, loss in losses_before.items()}
+    assert weighting.losses == pytest.approx(expected)
+    total = sum(plain.forward().losses.values())
+    (mean,) = torch.autograd.grad(total, plain.shared)
+    with torch.no_grad():
+        plain.shared += 0.3 * mean / mean.norm()
+    sum(plain.forward().losses.values()).backward()
+    torch.testing.assert_close(toy.shared.grad, plain.shared.grad)
+    for name, own in toy.own.items():
+        torch.testing.assert_close(own.grad, plain.own[name].grad)
+
+
+def test_samos_own_share_moves_up_the_losss_own_slope():
+    method, toy = compose("samo", {"alpha": 0.0, "rho": 0.3}, LOSSES, seed=0), Quadratics()
+    gradients = [torch.autograd.grad(loss, toy.shared)[0] for loss in toy.forward().losses.values()]
+    start = toy.shared.detach().clone()
+
+    def losses_at(shift):
+        with torch.no_grad():
+            toy.shared.copy_(start + shift[0])
+            return torch.stack(list(toy.forward().losses.values()))
+
+    shifts = method.shifts([sum(gradients)], losses_at, step_of(torch.ones(len(LOSSES))))
+    for (shift,), gradient in zip(shifts, gradients, strict=True):
+        assert shift.norm().item() == pytest.approx(0.3)
+        assert shift @ gradient > 0
+
+
+def test_samo_goes_around_another_method_and_works_in_parts():
+    whole, halves = Quadratics(), Quadratics()
+    for toy, parts in ((whole, 1), (halves, 2)):
+        method = compose("samo+mgda", {"samo": {"alpha": 1.0}}, LOSSES, seed=0)
+        weighting = backward(method, [[toy.forward] * parts], toy)
+        assert sum(weighting.weights.values()) == pytest.approx(1)
+    torch.testing.assert_close(whole.shared.grad, halves.shared.grad)
+
+
+@pytest.mark.parametrize("name", ["samo+mgda_ub", "samo+modo"])
+def test_samo_refuses_what_does_not_end_at_the_parameters(name):
+    with pytest.raises(ValueError, match="SAMO"):
+        composed(name)
 
 
 @pytest.mark.parametrize("name", ["mgda+cr", "cr+fixed", "fixed+gls", "mgda+nash", "cr+fixed+mgda"])

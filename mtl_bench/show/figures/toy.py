@@ -82,7 +82,7 @@ def steps_map(walks: Walks, steps: int, dpi: int = 200) -> Figure:
                 if all_there:
                     worst[row, column] = max(reached)
                 said = f"{max(reached)}" if all_there else f"{len(reached)} of {len(found)}"
-                dark = all_there and norm(max(reached)) > 0.55
+                dark = all_there and norm(max(reached)) > 0.4
                 color = "white" if dark else "black" if all_there else GRAY
                 axes.text(column, row, said, ha="center", va="center", fontsize=7, color=color)
         drawn = axes.imshow(worst, cmap=colors, norm=norm, aspect="auto")
