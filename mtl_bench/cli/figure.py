@@ -1,4 +1,4 @@
-"""`figure prediction`, `figure qualitative` and `figure cloud`: what a trained cell sees."""
+"""`figure`: what a trained cell sees, for print or as a page, and how methods do on a toy."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,6 +7,7 @@ import typer
 
 from mtl_bench.cli import options as o
 from mtl_bench.cli.help import App
+from mtl_bench.cli.toy import toy
 
 if TYPE_CHECKING:
     from mtl_bench.show.figures import Shown
@@ -53,10 +54,13 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: mtl-bench figure cloud --checkpoint runs/NAME --out a.html")(
         cloud
     )
+    group.command(epilog="Example: mtl-bench figure toy --methods fixed,mgda,nash --out toy.png")(
+        toy
+    )
     app.add_typer(
         group,
         name="figure",
-        help="Draw predictions for print, or as a 3D page.",
+        help="Draw predictions for print or as a 3D page, and methods on a toy.",
         rich_help_panel="One cell",
         epilog="Example: mtl-bench figure prediction --checkpoint runs/NAME --out a.pdf",
     )

@@ -106,6 +106,8 @@ def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
         yield "the gradients of a second batch ahead"
     elif values["batches"] != 1:
         yield f"{values['batches']} batches"
+    if _is_a(line, "Wrapper"):
+        yield "a method behind it that it wraps"
     if values.get("weighted_heads") or _is_a(line, "Composed"):
         yield "weighted decoders"
 
@@ -115,6 +117,8 @@ def _cost(line: Sequence[ast.ClassDef]) -> str:
     values = _declared(line)
     if values.get("needs") == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
+    if _is_a(line, "PerturbedMethod"):
+        return "1F + 1B + K(3F + H + T)"
     if _is_a(line, "CrossMethod"):  # decoders' own parameters only of the third
         return "3F + 2K(H + T) + KH + 1T"
     batches = values["batches"]
@@ -150,19 +154,33 @@ def details(card: Card) -> list[str]:
 PAGE = """# Weighting methods
 
 One method a file: its docstring has the source, what departs from it and where public code differs.
-A loss-value method and a gradient method together are a method, too: `--method a+b`. This page is
-written by `mtl-bench list methods --markdown`.
+A loss-value method and a gradient method together are a method, too: `--method a+b`; a wrapper goes
+before the gradient method. This page is written by `mtl-bench list methods --markdown`.
 
 {table}
 
 {legend}
-
+{toy}
 ## Formulas and hyper-parameters
 
 L losses, w weights, g gradients, J and G their matrix and Gramian, d the update direction of what
 is shared. Hyper-parameters are set with `--set method.NAME=VALUE`.
 
 {sections}"""
+
+
+TOY = """
+## On the field's toy
+
+Two losses of two parameters (`mtl_bench/show/toy.py` has them and their source). The published
+learning rate is 0.001; at the larger ones below the plain sum arrives, too.
+
+![Every method's paths from five starts]({paths})
+
+![Steps to the Pareto set by learning rate]({steps})
+
+`mtl-bench figure toy --methods NAME,NAME --out toy.png` draws both.
+"""
 
 
 def page(found: Iterable[Card], folder: Path) -> str:
@@ -177,8 +195,18 @@ def page(found: Iterable[Card], folder: Path) -> str:
     return PAGE.format(
         table="\n".join(f"| {' | '.join(line)} |" for line in lines),
         legend=LEGEND,
+        toy=_toy(folder),
         sections="\n".join(map(_section, found)),
     )
+
+
+def _toy(folder: Path) -> str:
+    """The two pictures, where they lie beside the package, as they do in a checkout."""
+    files = [plugins.PACKAGE.parent / f"reports/figures/toy{more}.png" for more in ("", "-steps")]
+    if not all(file.is_file() for file in files):
+        return ""
+    paths, steps = (Path(os.path.relpath(file, folder)).as_posix() for file in files)
+    return TOY.format(paths=paths, steps=steps)
 
 
 def _table_row(card: Card, folder: Path) -> list[str]:

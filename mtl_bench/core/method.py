@@ -152,6 +152,67 @@ class LookAheadMethod(GradientMethod):
         raise NotImplementedError
 
 
+class Wrapper(GradientMethod):
+    """A gradient method around another: in `a+b`, what `a` makes of the weights of `b`.
+
+    Args:
+        inner: what it is around where nothing is said.
+    """
+
+    def __init__(self, terms: Sequence[Term], inner: GradientMethod, seed: int = 0):
+        super().__init__(terms, seed)
+        self.around(inner)
+
+    def around(self, inner: GradientMethod) -> "Wrapper":
+        """Itself, around another method.
+
+        Raises:
+            ValueError: a method whose answer is more than weights of one batch's gradients.
+        """
+        if inner.needs == "jacobian" or inner.batches != 1:
+            name, other = type(self).__name__, type(inner).__name__
+            raise ValueError(f"{name} goes around methods that weigh one batch, not {other}")
+        self.inner, self.needs, self.weighted_heads = inner, inner.needs, inner.weighted_heads
+        return self
+
+    def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
+        return self.inner.head_weights(weight_K, step)
+
+
+class PerturbedMethod(Wrapper):
+    """A wrapper that has every loss differentiated at a point of its own, near the present one.
+
+    The method that it is around sees those gradients, and the losses where the point is.
+    """
+
+    def around(self, inner: GradientMethod) -> Wrapper:
+        """Itself, around another method.
+
+        Raises:
+            ValueError: one that wants gradients of anything but what is shared.
+        """
+        if inner.needs == "representation":
+            name, other = type(self).__name__, type(inner).__name__
+            raise ValueError(
+                f"{name} moves shared parameters, and {other} wants no gradients of them"
+            )
+        return super().around(inner)
+
+    def shifts(
+        self,
+        mean: Sequence[Tensor | None],
+        losses_at: Callable[[Sequence[Tensor]], Tensor],
+        step: Step,
+    ) -> list[list[Tensor]]:
+        """How far to move for each of K losses, tensor by tensor of what is shared.
+
+        Args:
+            mean: the gradient of the losses' mean, up to a positive factor.
+            losses_at: takes a shift, returns the losses [K] there.
+        """
+        raise NotImplementedError
+
+
 class Composed(Method):
     """A loss-value method first, a gradient method on the losses as it weighs them: `a+b`.
 

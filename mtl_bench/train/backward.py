@@ -29,6 +29,7 @@ from mtl_bench.core.method import (
     LookAheadMethod,
     LossMethod,
     Method,
+    PerturbedMethod,
     Step,
 )
 from mtl_bench.core.terms import gather
@@ -45,6 +46,7 @@ from mtl_bench.train.gramian import (
     products,
     unflatten,
 )
+from mtl_bench.train.perturbed import perturbed
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,10 @@ def backward(
     )
     assert isinstance(second, GradientMethod)
     step = _ByGradients(first, second, model, scale)
+    if isinstance(second, PerturbedMethod):
+        shared = trainable(model.shared_parameters())
+        with perturbed(second, batches[0], shared, frozen_statistics(model)) as parts:
+            return step.on_one_batch([parts], lr, cosines)
     if isinstance(second, CrossMethod):
         return step.on_three_batches(batches, cosines)
     return step.on_one_batch(batches, lr, cosines)

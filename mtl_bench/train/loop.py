@@ -10,11 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mtl_bench.core import plugins
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
 from mtl_bench.core.device import Compute, initial_weights, seed_for
-from mtl_bench.core.method import Composed, LossMethod, Method, Step
+from mtl_bench.core.method import Method, Step
 from mtl_bench.core.task import Task, tasks_of_cell, terms_of
 from mtl_bench.core.terms import Term
 from mtl_bench.data.loader import train_batches
@@ -22,6 +21,7 @@ from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model, build_model
 from mtl_bench.train import checkpoint
 from mtl_bench.train.backward import Pass, UnlabelledError, Weighting, backward, reevaluate
+from mtl_bench.train.compose import compose
 from mtl_bench.train.curve import Curve
 from mtl_bench.train.progress import Interrupted, Pace, Progress
 from mtl_bench.train.tracking import Tracker
@@ -172,26 +172,8 @@ def build(cell: Cell, compute: Compute) -> tuple[Model, Method, torch.optim.Opti
 
 
 def build_method(cell: Cell, terms: Sequence[Term]) -> Method:
-    """The cell's method over these terms; of `a+b`, the two composed.
-
-    Raises:
-        ValueError: two parts that are not a loss-value method and then a gradient method.
-    """
-    seed = seed_for(cell.seed, "method")
-    names = plugins.part_names(cell.method)
-    if len(names) == 1:
-        found: Method = plugins.load("methods", cell.method)(terms, seed=seed, **cell.method_args)
-        return found
-    parts = [
-        plugins.load("methods", name)(terms, seed=seed, **cell.method_args.get(name, {}))
-        for name in names
-    ]
-    if [isinstance(part, LossMethod) for part in parts] != [True, False]:
-        raise ValueError(
-            f"method '{cell.method}' is not a loss-value method + a gradient method; "
-            f"mtl-bench list methods says which is which"
-        )
-    return Composed(*parts)
+    """The cell's method over these terms."""
+    return compose(cell.method, cell.method_args, terms, seed_for(cell.seed, "method"))
 
 
 def schedule(step: int, optim: Optim) -> float:

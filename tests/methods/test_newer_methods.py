@@ -12,8 +12,12 @@ import torch
 from support.methods import head_weights, step_of, weights
 from support.terms import TERMS
 
+from mtl_bench.bench.check.methods import LOSSES, Quadratics
 from mtl_bench.core import plugins
+from mtl_bench.core.method import Composed
 from mtl_bench.core.terms import Term
+from mtl_bench.train.backward import backward
+from mtl_bench.train.compose import compose
 
 F64 = torch.float64
 
@@ -156,3 +160,115 @@ def test_ldc_counts_losses_from_their_first_value():
 def test_ldc_names_what_it_does_not_know():
     with pytest.raises(ValueError, match="tau 'two' is not one of one, weights"):
         plugins.load("methods", "ldc")(TERMS, tau="two")
+
+
+# --- wrappers -------------------------------------------------------------------------------------
+
+
+def gramians(count, tasks=3):
+    generator = torch.Generator().manual_seed(7)
+    for _ in range(count):
+        J_KP = torch.randn(tasks, 6, generator=generator, dtype=F64)
+        yield J_KP @ J_KP.T
+
+
+def composed(name, tasks=3, **settings):
+    terms = [Term(f"task{i}", "depth", "regression", 1.0) for i in range(tasks)]
+    return compose(name, settings, terms, seed=0)
+
+
+def test_cr_averages_the_weights_of_what_it_is_around():
+    method, plain = composed("cr+ntkmtl", cr={"alpha": 0.75}), make("ntkmtl", 3)
+    step, average = step_of(torch.ones(3, dtype=F64)), None
+    for G_KK in gramians(4):
+        new = plain.weights(G_KK, step)
+        average = new if average is None else 0.75 * average + 0.25 * new
+        torch.testing.assert_close(method.weights(G_KK, step), average)
+    torch.testing.assert_close(method.head_weights(average, step), average)
+
+
+def test_cr_equals_torchjds():
+    theirs = pytest.importorskip("torchjd.aggregation")
+    oracle = theirs.CRMOGMWeighting(theirs.UPGradWeighting(), alpha=0.9)
+    ours = composed("cr+upgrad")
+    for G_KK in gramians(5):
+        weight_K = ours.weights(G_KK, step_of(torch.ones(3, dtype=F64)))
+        torch.testing.assert_close(weight_K, oracle(G_KK), rtol=1e-4, atol=1e-6)
+
+
+def test_cr_keeps_the_weights_of_absent_tasks():
+    method = composed("cr+ntkmtl", cr={"alpha": 0.5})
+    both, one = step_of(losses(1, 1, 1)), step_of(losses(1), torch.tensor([1]))
+    first = method.weights(torch.diag(losses(1, 4, 1)), both)
+    method.weights(torch.diag(losses(9)), one)
+    assert method.weight_T.tolist() == [first[0], (first[1] + 1) / 2, first[2]]
+
+
+def test_a_composition_of_three_is_a_loss_value_method_on_a_wrapped_one():
+    method = composed("uncertainty+cr+nash", cr={"alpha": 0.5}, nash={"every": 3})
+    assert isinstance(method, Composed)
+    assert (type(method.gradient).__name__, method.gradient.alpha) == ("CorrelationReduced", 0.5)
+    assert (method.gradient.inner.every, method.gradient.weighted_heads) == (3, True)
+    assert composed("cr+mgda_ub").needs == "representation"
+    assert composed("cr+cr+mgda").inner.inner.needs == "gramian"
+
+
+def test_samo_with_the_mean_alone_takes_all_gradients_one_step_up():
+    method = compose("samo", {"alpha": 1.0, "rho": 0.3}, LOSSES, seed=0)
+    toy, plain = Quadratics(), Quadratics()
+    before, losses_before = toy.shared.detach().clone(), toy.forward().losses
+    weighting = backward(method, [[toy.forward]], toy)
+    assert torch.equal(toy.shared.detach(), before)  # bit by bit back where it was
+    expected = {name: loss.item() for name, loss in losses_before.items()}
+    assert weighting.losses == pytest.approx(expected)
+    total = sum(plain.forward().losses.values())
+    (mean,) = torch.autograd.grad(total, plain.shared)
+    with torch.no_grad():
+        plain.shared += 0.3 * mean / mean.norm()
+    sum(plain.forward().losses.values()).backward()
+    torch.testing.assert_close(toy.shared.grad, plain.shared.grad)
+    for name, own in toy.own.items():
+        torch.testing.assert_close(own.grad, plain.own[name].grad)
+
+
+def test_samos_own_share_moves_up_the_losss_own_slope():
+    method, toy = compose("samo", {"alpha": 0.0, "rho": 0.3}, LOSSES, seed=0), Quadratics()
+    gradients = [torch.autograd.grad(loss, toy.shared)[0] for loss in toy.forward().losses.values()]
+    start = toy.shared.detach().clone()
+
+    def losses_at(shift):
+        with torch.no_grad():
+            toy.shared.copy_(start + shift[0])
+            return torch.stack(list(toy.forward().losses.values()))
+
+    shifts = method.shifts([sum(gradients)], losses_at, step_of(torch.ones(len(LOSSES))))
+    for (shift,), gradient in zip(shifts, gradients, strict=True):
+        assert shift.norm().item() == pytest.approx(0.3)
+        assert shift @ gradient > 0
+
+
+def test_samo_goes_around_another_method_and_works_in_parts():
+    whole, halves = Quadratics(), Quadratics()
+    for toy, parts in ((whole, 1), (halves, 2)):
+        method = compose("samo+mgda", {"samo": {"alpha": 1.0}}, LOSSES, seed=0)
+        weighting = backward(method, [[toy.forward] * parts], toy)
+        assert sum(weighting.weights.values()) == pytest.approx(1)
+    torch.testing.assert_close(whole.shared.grad, halves.shared.grad)
+
+
+@pytest.mark.parametrize("name", ["samo+mgda_ub", "samo+modo"])
+def test_samo_refuses_what_does_not_end_at_the_parameters(name):
+    with pytest.raises(ValueError, match="SAMO"):
+        composed(name)
+
+
+@pytest.mark.parametrize("name", ["mgda+cr", "cr+fixed", "fixed+gls", "mgda+nash", "cr+fixed+mgda"])
+def test_parts_in_another_order_are_refused(name):
+    with pytest.raises(ValueError, match="is not a loss-value method"):
+        composed(name)
+
+
+@pytest.mark.parametrize("name", ["cr+modo", "cr+graddrop", "cr+auto_lambda"])
+def test_a_wrapper_refuses_what_answers_with_more_than_weights(name):
+    with pytest.raises(ValueError, match="goes around methods that weigh one batch, not"):
+        composed(name)

@@ -60,7 +60,9 @@ class PoseNetwork(nn.Module):
     def forward(self, image_B3HW: Tensor, context_B23HW: Tensor) -> Tensor:
         """transform_B244: target-camera points -> points of the previous and the next camera."""
         features = self.encoder(image_B3HW, context_B23HW)
-        vector_B26 = self.decoder(features).float().mean((2, 3)).unflatten(-1, (2, 6)) * self.scale_6
+        vector_B26 = (
+            self.decoder(features).float().mean((2, 3)).unflatten(-1, (2, 6)) * self.scale_6
+        )
         return torch.stack([pose_from_vector(v_B6) for v_B6 in vector_B26.unbind(1)], 1)
 
 
