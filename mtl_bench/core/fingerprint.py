@@ -34,6 +34,7 @@ HARNESS = "harness"
 EXCLUDED = {
     *("core.config", "core.recipe", "core.plain", "core.plugins", "core.provenance"),
     *("core.fingerprint", "core.columns", "core.quality", "core.files", "core.locks"),
+    *("core.toml_file",),
     *("train.progress", "train.tracking", "train.curve"),
     *("bench.jobs", "bench.store", "cli", "report", "show"),
 }

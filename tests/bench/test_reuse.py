@@ -1,6 +1,7 @@
 """What is not part of training is checked before it and trains nothing anew."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -10,8 +11,7 @@ import torch
 from mtl_bench.bench import store
 from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.launch import Here
-from mtl_bench.core.config import load_recipe, override, training_json
-from mtl_bench.data import scenes
+from mtl_bench.core.config import override, training_json
 from mtl_bench.train import loop
 
 QUICK = ["recipe.optim.steps=2", "recipe.latency.passes=1", "recipe.latency.warmup=0"]
@@ -75,7 +75,7 @@ def test_what_would_stop_a_cell_behind_training_stops_it_before(smoke_cell, here
 
 def test_a_bad_label_of_the_evaluation_stops_a_cell_before_training(smoke_cell, here, tmp_path):
     run, _ = here
-    root = scenes.ensure(load_recipe("smoke").data, tmp_path / "data", progress=False)
+    root = shutil.copytree(run.root, tmp_path / "data")
     label = sorted((root / "gtFine" / "val").rglob("*_instanceIds.png"))[-1]
     cv2.imwrite(str(label), cv2.imread(str(label))[::2])
     with pytest.raises(ValueError, match=label.name):
