@@ -124,10 +124,12 @@ def train(
     measured then, as there is no truth.
     """
     if continued is not None:
-        named = {"CELL.JSON": cell_file, "--backbone": backbone, "--method": method}
-        named |= {"--tasks": tasks, "--seed": seed, "--video": video, "--pretrained": pretrained}
-        named |= {"--single-task": single_task, "--recipe": recipe != "small"}
-        named["--granularity"] = granularity != GRANULARITIES[0]
+        named: dict[str, object] = {
+            **{"CELL.JSON": cell_file, "--backbone": backbone, "--method": method},
+            **{"--tasks": tasks, "--seed": seed, "--video": video, "--pretrained": pretrained},
+            **{"--single-task": single_task, "--recipe": recipe != "small"},
+            "--granularity": granularity != GRANULARITIES[0],
+        }
         for option in (option for option, value in named.items() if value):
             raise ValueError(f"{option} does not go with --continue, which takes RUN's: use --set")
         cell = _continuing(continued, runs)
