@@ -84,9 +84,7 @@ class TimmBackbone(Backbone):
             **options,
         )
         if pretrained not in (None, "timm"):
-            with torch.random.fork_rng(devices=[]):
-                whole = timm.create_model(name, **options).state_dict()
-            load_weights(self.pyramid, Path(str(pretrained)), whole)
+            load_weights(self.pyramid, Path(str(pretrained)), _whole(name))
         info = self.pyramid.feature_info
         reductions = dict(zip(info.reduction(), info.channels(), strict=True))
         self.channels = {stride: reductions[stride] for stride in strides}
@@ -140,6 +138,13 @@ def _levels(name: str, output_stride: int) -> tuple[dict[int, int], dict[str, An
             raise ValueError(f"timm's '{name}': {str(error).splitlines()[0]}") from None
     info = model.feature_info
     return dict(zip(info.reduction(), info.out_indices, strict=True)), options
+
+
+@functools.cache
+def _whole(name: str) -> tuple[str, ...]:
+    """Names of all weights of a timm model, stages included that a pyramid does not build."""
+    with torch.random.fork_rng(devices=[]):
+        return tuple(timm.create_model(name, **_levels(name)[1]).state_dict())
 
 
 def _listed(numbers: Collection[int]) -> str:
