@@ -363,7 +363,7 @@ class Task:
         """
         return self
 
-    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> View | None:
+    def view_of(self, results: Mapping[str, Results], camera_height_m: float | None) -> View | None:
         """What a viewer sees of the results of a batch of one, where there is something to see.
 
         Args:

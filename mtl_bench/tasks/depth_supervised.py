@@ -99,7 +99,7 @@ class DepthSupervised(Task):
 
     # --- for a viewer -----------------------------------------------------------------------------
 
-    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> "ValueView":
+    def view_of(self, results: Mapping[str, Results], camera_height_m: float | None) -> "ValueView":
         found_HW = results[self.name]["supervised"][0].cpu().numpy()
         return ValueView(_near_bright(found_HW, self.inverse))
 

@@ -95,7 +95,9 @@ class Normals(Task):
 
     # --- for a viewer -----------------------------------------------------------------------------
 
-    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> "NormalView":
+    def view_of(
+        self, results: Mapping[str, Results], camera_height_m: float | None
+    ) -> "NormalView":
         return NormalView(colors(results[self.name]["normals"][0].cpu().numpy()))
 
     @classmethod

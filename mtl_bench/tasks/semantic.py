@@ -86,7 +86,7 @@ class Semantic(Task):
 
     # --- for a viewer -----------------------------------------------------------------------------
 
-    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> "ClassView":
+    def view_of(self, results: Mapping[str, Results], camera_height_m: float | None) -> "ClassView":
         return ClassView.of(results[self.name]["class"][0].cpu().numpy(), self.labels)
 
     @classmethod

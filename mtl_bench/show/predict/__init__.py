@@ -95,7 +95,7 @@ class Predictor:
         tasks = [task.at_size(own) for task in self.model.tasks]
         with evaluating(self.model), torch.inference_mode():
             found = predict(self.model, batch, tasks, own)
-        views = (task.view(found, camera_height_m) for task in tasks)
+        views = (task.view_of(found, camera_height_m) for task in tasks)
         seen = tuple(view for view in views if view is not None)
         return Predicted(image_HW3, np.asarray(K_33, np.float64), seen)
 

@@ -271,7 +271,7 @@ class Depth(Task):
 
     # --- for a viewer -----------------------------------------------------------------------------
 
-    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> DepthView:
+    def view_of(self, results: Mapping[str, Results], camera_height_m: float | None) -> DepthView:
         """In the network's unit where no scale was found; 0 where the class has no surface."""
         found = {name: value[0].cpu() for name, value in results[self.name].items()}
         depth_HW, source = found["depth"][0].numpy(), int(found["source"])

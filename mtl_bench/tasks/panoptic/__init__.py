@@ -276,7 +276,9 @@ class Panoptic(Task):
         scaled = replace(ev, nms_kernel=kernel, stuff_area=round(ev.stuff_area * times**2))
         return Panoptic(replace(self.recipe, evaluate=scaled), self.labels)
 
-    def view(self, results: Mapping[str, Results], camera_height_m: float | None) -> PanopticView:
+    def view_of(
+        self, results: Mapping[str, Results], camera_height_m: float | None
+    ) -> PanopticView:
         """Metrics see no class that is not evaluated, a viewer does: its bare label id."""
         found = {name: value[0].cpu() for name, value in results[self.name].items()}
         ids_HW = grouping.to_instance_ids(found["panoptic"], self.labels).numpy()
