@@ -204,7 +204,7 @@ class Task:
             "has_points",
             "like_trained",
             "at_size",
-            "view",
+            "view_of",
             "files",
             "scored",
             "read_result",
