@@ -45,7 +45,7 @@ class Reconstruct(Task):
         ),
         Column("rmse", "reconstruct.rmse", "RMSE", -1, 4),
     )
-    words: ClassVar[Mapping[str, str]] = {"trivial": "the mean picture of the training split"}
+    words: ClassVar[Mapping[str, str]] = {"trivial": "mean picture"}
 
     def head(self, inputs: tuple[int, ...], sizes: Network) -> "PictureHead":
         data = self.recipe.data

@@ -35,7 +35,7 @@ class Regress(Task):
         ),
         Column("rmse", "regress.rmse", "RMSE", -1, 4),
     )
-    words: ClassVar[Mapping[str, str]] = {"trivial": "the mean number of the training split"}
+    words: ClassVar[Mapping[str, str]] = {"trivial": "mean number"}
 
     def head(self, inputs: tuple[int, ...], sizes: Network) -> VectorHead:
         return VectorHead(self.name, "number", sizes, 1)

@@ -188,7 +188,9 @@ def test_no_module_names_a_task(path):
 
 
 def test_columns_are_of_tasks_that_exist():
-    assert {column.task for column in quality.quality()} == set(plugins.files("tasks"))
+    assert {plugins.stem_and_field(c.task)[0] for c in quality.quality()} == set(
+        plugins.files("tasks")
+    )
     assert {column.task for column in quality.agreement()} <= set(plugins.files("tasks"))
 
 
