@@ -45,6 +45,9 @@ def adopt(cell: Cell, runs: Path, data: Data | None = None) -> str:
                 shutil.copy(path.parent / name, directory / name)
         import torch
 
+        from mtl_bench.train.checkpoint import owner
+
+        state["cell"] = owner(cell)
         with replacing(directory / CHECKPOINT) as file:  # last: what is there is whole
             torch.save(state, file)
         return f"trained already, in {path.parent}: only what comes after it is run"
