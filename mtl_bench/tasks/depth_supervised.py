@@ -76,8 +76,10 @@ class DepthSupervised(Task):
     def losses(self, maps: Maps, batch: Batch) -> dict[str, Tensor]:
         true_BHW = full(batch.fields[self.true])
         valid_BHW = true_BHW > 0
+        if not valid_BHW.any():
+            return {}
         error_BHW = (full(maps[self.name])[:, 0] - true_BHW).abs() * valid_BHW
-        return {"depth_l1": error_BHW.sum() / valid_BHW.sum().clamp(min=1)}
+        return {"depth_l1": error_BHW.sum() / valid_BHW.sum()}
 
     def finish(
         self, maps: Maps, camera: Camera, done: Mapping[str, Results], size: Size | None = None

@@ -73,8 +73,10 @@ class Normals(Task):
         """One minus the mean cosine over the pixels that have a normal."""
         true_B3HW = full(batch.fields["normals"])
         valid_BHW = true_B3HW.square().sum(1) > 0.5
+        if not valid_BHW.any():
+            return {}
         lost_BHW = 1 - (F.normalize(full(maps[self.name]), dim=1) * true_B3HW).sum(1)
-        return {"normal_cosine": (lost_BHW * valid_BHW).sum() / valid_BHW.sum().clamp(min=1)}
+        return {"normal_cosine": (lost_BHW * valid_BHW).sum() / valid_BHW.sum()}
 
     def finish(
         self, maps: Maps, camera: Camera, done: Mapping[str, Results], size: Size | None = None

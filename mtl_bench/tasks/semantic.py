@@ -66,9 +66,10 @@ class Semantic(Task):
     def losses(self, maps: Maps, batch: Batch) -> dict[str, Tensor]:
         """Mean over the pixels that have a label."""
         true_BHW = batch.fields["class"].long()
-        logits_BCHW = full(maps[self.name])
-        total = F.cross_entropy(logits_BCHW, true_BHW, ignore_index=IGNORE, reduction="sum")
-        return {"cross_entropy": total / (true_BHW != IGNORE).sum().clamp(min=1)}
+        if not (true_BHW != IGNORE).any():
+            return {}
+        loss = F.cross_entropy(full(maps[self.name]), true_BHW, ignore_index=IGNORE)
+        return {"cross_entropy": loss}
 
     def finish(
         self, maps: Maps, camera: Camera, done: Mapping[str, Results], size: Size | None = None

@@ -157,7 +157,7 @@ def test_nothing_valid_is_no_number(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_losses_leave_out_what_has_no_value(name):
-    """The loss is that of the valid pixels alone, and 0 with a gradient where there is none."""
+    """The loss is that of the valid pixels alone, and absent where there is none."""
     task, generator = task_of(name), torch.Generator().manual_seed(0)
     channels = {"semantic": 13, "depth_supervised": 1, "normals": 3}[name]
     raw = torch.randn(2, channels, H, W, generator=generator, requires_grad=True)
@@ -170,19 +170,16 @@ def test_losses_leave_out_what_has_no_value(name):
     key = {"semantic": "class", "depth_supervised": "depth_m", "normals": "normals"}[name]
     nothing = IGNORE if name == "semantic" else 0
 
-    def loss(maps, value):
-        (found,) = task.losses({name: maps}, Batch(["a", "b"], torch.zeros(2, 3, H, W),
-                                                   fields={key: value})).values()  # fmt: skip
-        return found
+    def losses(maps, value):
+        images = torch.zeros(2, 3, H, W)
+        return task.losses({name: maps}, Batch(["a", "b"], images, fields={key: value}))
 
     half = field.clone()
     half[..., : W // 2] = nothing
-    cut = loss(raw[..., W // 2 :], field[..., W // 2 :])
-    assert loss(raw, half).item() == pytest.approx(cut.item(), rel=1e-5)
-    zero = loss(raw, torch.full_like(field, nothing))
-    zero.backward()
-    assert zero.item() == 0
-    assert raw.grad.abs().sum() == 0
+    (cut,) = losses(raw[..., W // 2 :], field[..., W // 2 :]).values()
+    (found,) = losses(raw, half).values()
+    assert found.item() == pytest.approx(cut.item(), rel=1e-5)
+    assert losses(raw, torch.full_like(field, nothing)) == {}
 
 
 def test_depth_of_a_data_set_without_any_is_one_line():

@@ -344,7 +344,6 @@ def test_noise_and_wrong_road_pixels_move_the_scale_little():
 @pytest.mark.parametrize("top_k", [0, 1000, 5000])
 def test_more_instances_than_an_id_holds_are_refused(top_k):
     """Car 1000 of an image was the first truck: an id is a class * 1000 + a number."""
-    recipe = Recipe(evaluate=settings(top_k=top_k))
-    with pytest.raises(ValueError, match=rf"recipe\.evaluate\.top_k = {top_k}: .* 1 to 999"):
-        tasks_of(recipe, ("panoptic",), CITYSCAPES20)
+    with pytest.raises(ValueError, match=rf"top_k = {top_k} must be (>= 1|<= 999)"):
+        settings(top_k=top_k)
     tasks_of(Recipe(evaluate=settings(top_k=999)), ("panoptic",), CITYSCAPES20)

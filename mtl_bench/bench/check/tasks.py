@@ -142,7 +142,7 @@ def _no_pixels(kind: type[Task]) -> str | None:
     assert root is not None
     samples = open_samples(task.recipe, model.tasks, "train", root, training=True)
     kinds, read = samples.dataset.fields, samples.dataset.read
-    valued = sorted(name for name in kind.needs & kinds.keys() if kinds[name] not in _BLANK)
+    valued = sorted(name for name in task.needs & kinds.keys() if kinds[name] not in _BLANK)
     if valued:
         return f"not tried: padding has a value in {', '.join(valued)}"
 

@@ -116,14 +116,6 @@ class Panoptic(Task):
         "another, and nearly tied logits make equal panoptic pixels say less",
     }
 
-    def __init__(self, recipe: Recipe, labels: LabelSet) -> None:
-        super().__init__(recipe, labels)
-        if not 1 <= recipe.evaluate.top_k < DIVISOR:  # one more would be the next class's
-            raise ValueError(
-                f"recipe.evaluate.top_k = {recipe.evaluate.top_k}: an id holds 1 to {DIVISOR - 1} "
-                f"instances of an image"
-            )
-
     # --- network ----------------------------------------------------------------------------------
 
     def head(self, inputs: tuple[int, ...], sizes: Network) -> PanopticHead:
