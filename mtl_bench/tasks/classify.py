@@ -36,9 +36,7 @@ class Classify(Task):
             short=True,
         ),
     )
-    words: ClassVar[Mapping[str, str]] = {
-        "trivial": "the most frequent class of the training split"
-    }
+    words: ClassVar[Mapping[str, str]] = {"trivial": "most frequent class"}
 
     def head(self, inputs: tuple[int, ...], sizes: Network) -> VectorHead:
         return VectorHead(self.name, "logits", sizes, len(self.labels))
