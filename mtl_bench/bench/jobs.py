@@ -51,7 +51,7 @@ class Timing(Checked):
     precision: Annotated[str, "fp32, or what the engine has beside it"] = "fp32"
     size: Annotated[str, "height x width of the image, pixels"] = "1024x2048"
     tasks: Annotated[
-        tuple[Annotated[str, plugins.IS_NAME], ...], SOME, DISTINCT, "whose heads are timed"
+        tuple[Annotated[str, plugins.IS_TASK], ...], SOME, DISTINCT, "whose heads are timed"
     ] = Recipe.tasks
     device: Annotated[str, one_of("cpu", "cuda"), "the kind; its name stands in the row"] = "cpu"
     passes: Annotated[Count, "timed ones; the paper's are 500"] = 500

@@ -84,7 +84,7 @@ class TimmBackbone(Backbone):
             **options,
         )
         if pretrained not in (None, "timm"):
-            load_weights(self.pyramid, Path(str(pretrained)), _whole(name))
+            load_weights(self.pyramid, Path(str(pretrained)), _whole(name, self.output_stride))
         info = self.pyramid.feature_info
         reductions = dict(zip(info.reduction(), info.channels(), strict=True))
         self.channels = {stride: reductions[stride] for stride in strides}
@@ -141,10 +141,10 @@ def _levels(name: str, output_stride: int) -> tuple[dict[int, int], dict[str, An
 
 
 @functools.cache
-def _whole(name: str) -> tuple[str, ...]:
+def _whole(name: str, output_stride: int) -> tuple[str, ...]:
     """Names of all weights of a timm model, stages included that a pyramid does not build."""
     with torch.random.fork_rng(devices=[]):
-        return tuple(timm.create_model(name, **_levels(name)[1]).state_dict())
+        return tuple(timm.create_model(name, **_levels(name, output_stride)[1]).state_dict())
 
 
 def _listed(numbers: Collection[int]) -> str:

@@ -25,7 +25,7 @@ from mtl_bench.core.plain import (
     one_of,
     to_dict,
 )
-from mtl_bench.core.plugins import IS_NAME
+from mtl_bench.core.plugins import IS_NAME, IS_TASK
 from mtl_bench.core.recipe import (
     Augment,
     Data,
@@ -102,7 +102,7 @@ class Cell(Checked):
     backbone: Annotated[str, IS_NAME, "its name, see `list backbones`"]
     method: Annotated[str, IS_NAME, "a name, or a loss-value method and a gradient method: a+b"]
     tasks: Annotated[
-        tuple[Annotated[str, IS_NAME], ...], DISTINCT, "names; none: the recipe's"
+        tuple[Annotated[str, IS_TASK], ...], DISTINCT, "names; none: the recipe's"
     ] = ()
     seed: Annotated[Whole, "of initial weights, data order and method"] = 0
     video: Annotated[bool, "the second training, on pseudo-labeled frames too"] = False

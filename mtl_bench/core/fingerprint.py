@@ -34,9 +34,9 @@ HARNESS = "harness"
 EXCLUDED = {
     *("core.config", "core.recipe", "core.plain", "core.plugins", "core.provenance"),
     *("core.fingerprint", "core.columns", "core.quality", "core.files", "core.locks"),
-    *("core.toml_file",),
+    *("core.toml_file", "core.canvas", "core.view"),
     *("train.progress", "train.tracking", "train.curve"),
-    *("bench.jobs", "bench.store", "cli", "report", "show"),
+    *("bench.jobs", "bench.store", "bench.data_state", "cli", "report", "show"),
 }
 MEMBERS = "stage_members"
 SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)

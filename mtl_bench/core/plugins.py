@@ -62,7 +62,11 @@ NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders ar
 NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
 IS_NAME = Rule(
     "a name of a-z, 0-9 and _",
-    lambda value: all(NAME.fullmatch(part) for part in re.split("[+:]", value) if value),
+    lambda value: all(NAME.fullmatch(part) for part in part_names(value) if value),
+)
+IS_TASK = Rule(
+    "a name of a-z, 0-9 and _, or that, a colon and a field of letters, digits and _",
+    lambda value: bool(re.fullmatch(rf"{NAME.pattern}(:\w+)?", value, re.ASCII)),
 )
 TOLD = re.compile(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", re.MULTILINE)  # in a section Args
 PLAIN = {"int": int, "float": float, "bool": bool, "str": str}

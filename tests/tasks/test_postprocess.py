@@ -344,6 +344,6 @@ def test_noise_and_wrong_road_pixels_move_the_scale_little():
 @pytest.mark.parametrize("top_k", [0, 1000, 5000])
 def test_more_instances_than_an_id_holds_are_refused(top_k):
     """Car 1000 of an image was the first truck: an id is a class * 1000 + a number."""
-    with pytest.raises(ValueError, match=rf"top_k = {top_k} must be (>= 1|<= 999)"):
+    with pytest.raises(ValueError, match=rf"'top_k' must be (>= 1|<= 999), not {top_k}"):
         settings(top_k=top_k)
     tasks_of(Recipe(evaluate=settings(top_k=999)), ("panoptic",), CITYSCAPES20)
