@@ -12,11 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mtl_bench.core.plain import did_you_mean
 from mtl_bench.core.recipe import Network
 from mtl_bench.core.task import Maps, TaskHead
 
-MGNET, ASPP, NONE = "mgnet", "aspp", "none"  # decoders of a recipe
+MGNET, ASPP = "mgnet", "aspp"  # decoders of a recipe; "none" is the third
 LEAK = 0.01  # LeakyReLU slope of the paper's InPlaceABN
 
 
@@ -184,13 +183,10 @@ class DenseHead(TaskHead):
             decoder = AtrousPyramid(inputs[-1], sizes.channels)
             last = nn.Conv2d(sizes.head, outputs, 1)
             head = nn.Sequential(_conv_relu(sizes.channels, sizes.head, 3), last)
-        elif sizes.decoder == NONE:
+        else:
             decoder = Finest()
             first = nn.Conv2d(inputs[0], sizes.head, 3, padding=1)
             head = nn.Sequential(first, nn.Conv2d(sizes.head, outputs, 1))
-        else:
-            known = did_you_mean(sizes.decoder, (MGNET, ASPP, NONE))
-            raise ValueError(f"recipe.network.decoder is not '{sizes.decoder}'{known}")
         self.decoders, self.heads = nn.ModuleDict({name: decoder}), nn.ModuleDict({name: head})
 
     def forward(
