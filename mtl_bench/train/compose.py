@@ -21,6 +21,9 @@ def compose(name: str, settings: Mapping[str, Any], terms: Sequence[Term], seed:
     names = plugins.part_names(name)
     of = {name: settings} if len(names) == 1 else settings
     parts = [plugins.load("methods", n)(terms, seed=seed, **of.get(n, {})) for n in names]
+    if len(parts) == 1:
+        whole: Method = parts[0]
+        return whole
     first = [parts.pop(0)] if isinstance(parts[0], LossMethod) else []
     wrappers, last = parts[:-1], parts[-1:]
     if not all(isinstance(part, Wrapper) for part in wrappers) or not all(
@@ -32,5 +35,5 @@ def compose(name: str, settings: Mapping[str, Any], terms: Sequence[Term], seed:
         )
     for wrapper in reversed(wrappers):
         last = [wrapper.around(*last)]
-    found: Method = Composed(*first, *last) if first and last else [*first, *last][0]
+    found: Method = Composed(*first, *last) if first else last[0]
     return found

@@ -419,9 +419,13 @@ def test_a_damaged_record_is_named(scenes, begun):
 
 def test_what_cannot_be_labelled(scenes, knowing, tmp_path):
     out = tmp_path / "out"
-    refused("positive", Oracle(never), with_pseudo(scales=(1.0, 0.0)), scenes, out)
-    refused("positive", Oracle(never), with_pseudo(scales=()), scenes, out)
-    refused("0 to 1, not 1.5", Oracle(never), with_pseudo(min_confidence=1.5), scenes, out)
+    for wrong, message in (
+        ({"scales": (1.0, 0.0)}, "must be > 0, not 0.0"),
+        ({"scales": ()}, "must be non-empty"),
+        ({"min_confidence": 1.5}, "must be <= 1, not 1.5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            with_pseudo(**wrong)
     labelled = shutil.copytree(scenes, tmp_path / "labelled")
     for name in BETWEEN:
         path = file_of(labelled / "gtFine" / "train", LABELS, name)
