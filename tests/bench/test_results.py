@@ -82,7 +82,7 @@ def test_row_is_stale_when_its_code_changed(cell, directory, tmp_path, change_ha
     state = store.inspect(cell, runs)
     assert (state.why, state.trained) == ("evaluate, time: harness changed", True)
     method.write_text("class Mine(")
-    assert "mine.py: SyntaxError" in store.inspect(cell, runs).why
+    assert "mine.py, line 1: SyntaxError" in store.inspect(cell, runs).why
     method.unlink()
     assert "no method called 'mine'" in store.inspect(cell, runs).why
     assert not store.inspect(cell, runs).trained

@@ -155,7 +155,7 @@ def test_a_good_tree(tree):
         (lambda t: edit(t / ATTRIBUTES, " -1", " 0"), r"attr_celeba.txt:3: .* -1 or 1 stand here"),
         (lambda t: edit(t / PARTITION, " 1\n", " 7\n"), r"partition.txt:13: .* 0, 1 or 2 stand"),
         (lambda t: (t / IMAGES / "000013.jpg").unlink(), r"000013.jpg.*missing"),
-        (lambda t: (t / IMAGES / "000013.jpg").write_text("x"), r"000013.jpg: damaged"),
+        (lambda t: (t / IMAGES / "000013.jpg").write_text("x"), r"000013.jpg: .*damaged"),
     ],
 )
 def test_a_bad_tree(tree, spoil, message):
