@@ -16,8 +16,10 @@ from collections.abc import Mapping, Sequence
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
+from mtl_bench.core.locks import LAUNCHER
+
 PROGRAM = (sys.executable, "-m", "mtl_bench")
-MODULES = ("mtl_bench.__main__", "mtl_bench.bench.run")
+MODULES = ("mtl_bench.cli.app", "mtl_bench.bench.run")
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -97,5 +99,7 @@ def _run(words: list[str], log: str, environment: dict[str, str]) -> None:
             os.dup2(file.fileno(), number)
     os.environ.clear()
     os.environ.update(environment)
+    if LAUNCHER in environment:  # what this was forked from ends with it
+        os.environ[LAUNCHER] = str(os.getppid())
     sys.argv = ["mtl-bench", *words]
     runpy.run_module("mtl_bench", run_name="__main__", alter_sys=True)

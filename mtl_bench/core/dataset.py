@@ -166,11 +166,6 @@ class Dataset:
         training: bool = False,
         truth: str = "default",
     ) -> None:
-        if data.stride < 1 or not data.min_flow >= 0:
-            raise ValueError(
-                f"recipe.data.stride = {data.stride} must be 1 or more, recipe.data.min_flow = "
-                f"{data.min_flow:g} 0 or more"
-            )
         self.root, self.split, self.data = root, split, data
         self.needs, self.training, self.truth = frozenset(needs), training, truth
         unknown = self.needs - {NEIGHBOURS} - self.fields.keys()

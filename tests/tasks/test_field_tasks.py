@@ -6,7 +6,7 @@ import torch
 from sklearn.metrics import accuracy_score, f1_score, r2_score, root_mean_squared_error
 
 from mtl_bench.core import plugins
-from mtl_bench.core.config import Cell, load_recipe
+from mtl_bench.core.config import Cell, check_cells, load_recipe
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.quality import columns_of
 from mtl_bench.core.task import tasks_of
@@ -119,7 +119,7 @@ def test_columns_are_of_every_field_that_a_data_set_has():
 def test_tasks_with_and_without_a_field(tasks, message):
     cell = Cell(load_recipe("scales"), "mlp", "fixed", tasks)
     with pytest.raises(ValueError, match=message):
-        plugins.check_cells([cell])
+        check_cells([cell])
 
 
 def test_a_field_that_the_data_set_has_not():
