@@ -151,6 +151,15 @@ def _candidates(kind: str) -> dict[str, list[Path]]:
     return dict(sorted(found.items()))
 
 
+def stamps(*kinds: str) -> tuple[object, ...]:
+    """What changes when a file of these kinds comes, goes or is edited."""
+    paths = [path for kind in kinds for several in _candidates(kind).values() for path in several]
+    return tuple(
+        (path, *((s := path.stat()).st_mtime_ns, s.st_size)) if path.is_file() else path
+        for path in paths
+    )
+
+
 def stem_and_field(task: str) -> tuple[str, str]:
     """A task's file and the field that it is of: `regress:y0` -> regress, y0; without one ""."""
     stem, _, field = task.partition(":")

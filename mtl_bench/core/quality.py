@@ -52,7 +52,7 @@ def _read(task: str, text: bytes, name: str) -> Any:
 
 def quality() -> tuple[Column, ...]:
     """The columns of what tasks measure, in the order in which a table has them."""
-    return tuple(_columns("columns"))
+    return _columns("columns")
 
 
 def agreement() -> tuple[Column, ...]:
@@ -102,10 +102,16 @@ def _of_field(column: Column, field: str) -> Column:
     )
 
 
-def _columns(name: str) -> list[Column]:
+def _columns(name: str) -> tuple[Column, ...]:
     """Of every task that is found; an heir's own alone, as its task's are there."""
+    return _read_columns(name, plugins.stamps("tasks", "datasets"))
+
+
+@functools.lru_cache(maxsize=8)
+def _read_columns(name: str, stamps: tuple[object, ...]) -> tuple[Column, ...]:
+    """Read once, as long as the files are those: reports ask for every number."""
     found = {c.name: c for task in _tasks() for c in columns_of(task, name)}
-    return list(found.values())
+    return tuple(found.values())
 
 
 def in_brief() -> list[Column]:

@@ -561,7 +561,8 @@ def _states(rows: Iterable[Row]) -> str:
 
 def _every_cell(rows: Sequence[Row]) -> Section | None:
     """Every cell on its own: slug, seed, status, and the numbers that carry the table."""
-    brief = [column for column in quality.quality() if column in quality.in_brief()]
+    brief = quality.in_brief()
+    brief = [column for column in quality.quality() if column in brief]
     shown = [*(c for c in brief if any(single(row, c) != NOTHING for row in rows)), FPS]
     lines = []
     for row in rows:

@@ -133,11 +133,8 @@ def test_a_data_set_of_ones_own_is_trained_on(found, tmp_path):
     row = json.loads(path.read_text())
     assert row["protocol"]["dataset"] == "rooms"
     assert row["metric"]["slopes.mean_angle"] > 0
-    assert {key.split(".")[2] for key in row["metric"] if key.startswith("semantic.class.")} == {
-        "floor",
-        "wall",
-        "chair",
-    }
+    classes = {key.split(".")[2] for key in row["metric"] if key.startswith("semantic.class.")}
+    assert {"floor", "wall", "chair"} <= classes <= {"floor", "wall", "chair", "table"}
     assert "rooms" in run("list", "datasets")
     report = run("latency", "--checkpoint", path.parent, "--size", "32x64", "--engine", "exported",
                  "--data", root, "--passes", "2")  # fmt: skip

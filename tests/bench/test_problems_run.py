@@ -2,6 +2,7 @@
 
 import pytest
 
+from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.grid import load_grid
 from mtl_bench.bench.launch import Here
 from mtl_bench.core.dataset import dataset_of
@@ -24,7 +25,7 @@ def rows(recipe: str, tmp_path, methods: str, settings=()) -> list[dict]:
         root = kind.render(grid.recipe.data)
     else:
         kind.example(root, grid.recipe.data)
-    here = Here(tmp_path / "runs", root, "cpu", "off", lambda line: None)
+    here = Here(tmp_path / "runs", root, "cpu", "off", lambda line: None, Data(root))
     for cell in grid.jobs:
         here.run(cell, rerun=False, stale=False)
     return [read_json(tmp_path / "runs" / cell.slug / "row.json") for cell in grid.jobs]
