@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
@@ -99,7 +100,9 @@ def _run(words: list[str], log: str, environment: dict[str, str]) -> None:
             os.dup2(file.fileno(), number)
     os.environ.clear()
     os.environ.update(environment)
-    if LAUNCHER in environment:  # what this was forked from ends with it
+    # What this was forked from lives as long as somebody holds this end: the launcher alone is to.
+    os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]
+    if LAUNCHER in environment:
         os.environ[LAUNCHER] = str(os.getppid())
     sys.argv = ["mtl-bench", *words]
     runpy.run_module("mtl_bench", run_name="__main__", alter_sys=True)

@@ -1,8 +1,10 @@
 """Processes that are forked from one that has imported torch, as the launcher uses them."""
 
 import signal
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -37,6 +39,37 @@ def test_it_takes_signals(tmp_path):
     killed = Forked(words, tmp_path / "log.txt", {})
     killed.kill()
     assert killed.wait(120) == -signal.SIGKILL
+
+
+LAUNCHING = """
+import os, sys, time
+from pathlib import Path
+from mtl_bench.bench.preloaded import Forked
+from mtl_bench.core.locks import LAUNCHER
+
+words = ["train", "--recipe", "scales", "--method", "fixed", "--runs", sys.argv[1]]
+words += ["--set", "recipe.optim.steps=1000000"]
+process = Forked(words, Path(sys.argv[2]), {**os.environ, LAUNCHER: str(os.getpid())})
+print(process.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def test_it_ends_with_the_launcher_and_not_before(tmp_path):
+    words = [sys.executable, "-c", LAUNCHING, str(tmp_path / "runs"), str(tmp_path / "log.txt")]
+    launcher = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    cell = Path(f"/proc/{int(launcher.stdout.readline())}")
+
+    def waits_for(happened) -> bool:
+        return any(happened() or time.sleep(0.2) for _ in range(600))
+
+    assert waits_for(lambda: list(tmp_path.glob("runs/*/progress.json")))
+    time.sleep(3)  # in which it looks thrice whether its launcher is there
+    assert cell.exists(), (tmp_path / "log.txt").read_text()
+    launcher.kill()
+    launcher.wait()
+    assert waits_for(lambda: not cell.exists())
+    assert "interrupted: stopped at step" in (tmp_path / "log.txt").read_text()
 
 
 def test_other_programs_and_changed_code_are_not_forked(monkeypatch):
