@@ -35,6 +35,7 @@ from mtl_bench.deploy import engines
 
 PROTOCOL = 1  # raised when times taken before stop being comparable with times taken after
 NOTHING: Mapping[str, Any] = MappingProxyType({})
+LATER = (("network", "decoder"),)  # as in core/config.py, of recipes' values that timings have
 SIZE = re.compile(r"([1-9]\d*)x([1-9]\d*)")
 
 
@@ -111,6 +112,10 @@ def canonical_json(timing: Timing) -> str:
     """
     recipe = to_dict(recipe_of(timing))
     values = to_dict(timing) | {key: recipe[key] for key in ("network", "evaluate")}
+    defaults = to_dict(Recipe())
+    for section, key in LATER:
+        if values[section][key] == defaults[section][key]:
+            del values[section][key]
     del values["recipe"]
     if timing.weights is not None:
         values["weights"] = load_cell(Path(timing.weights) / "cell.json").id

@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 
 import pytest
 
@@ -326,3 +327,21 @@ def test_unknown_grid():
         load_grid("backbone")
     with pytest.raises(ValueError, match=r"no grid called 'none/such.toml'"):
         load_grid("none/such.toml")
+
+
+IDS = [  # digests of all ids of a shipped grid, and of its smoke run: what was run is found by them
+    ("ablation", "8407fac9523f", "8093db8f83e2"),
+    ("ablation-controls", "0a43d0ed7bad", "91dd77aa3da9"),
+    ("backbones", "cb9cbb0e7c7c", "1d2d158a9724"),
+    ("kitti", "43149427a83e", "502da380f4d0"),
+    ("latency", "a77fe8bc6487", "a266f7898b34"),
+    ("seeds", "c60e0723821a", "89cafecefdb1"),
+    ("weighting", "8ba903f551b6", "90b57b1a1c87"),
+]
+
+
+@pytest.mark.parametrize(("name", "whole", "smoke"), IDS)
+def test_no_id_of_a_shipped_grid_changes(name, whole, smoke):
+    for digest, brief in ((whole, False), (smoke, True)):
+        ids = sorted(job.id for job in load_grid(name, smoke=brief).jobs)
+        assert hashlib.sha256(" ".join(ids).encode()).hexdigest()[:12] == digest
