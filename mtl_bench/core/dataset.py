@@ -114,17 +114,19 @@ class Dataset:
         needs: fields that tasks ask for, and NEIGHBOURS.
         training: whether training samples are made of it, or the frames are only evaluated.
         truth: one of `truths`, or "default".
+        further_labels: where `takes_further_labels`, a folder of labels of further frames.
 
     Raises:
-        ValueError: no frames, or frames that lack a file, the first one named.
+        ValueError: no such split, no frames, or frames that lack a file, the first one named.
     """
 
     labels: ClassVar[LabelSet]
     fields: ClassVar[Mapping[str, Kind]]
+    splits: ClassVar[tuple[str, ...]] = ("train", "val", "test")
     truths: ClassVar[tuple[str, ...]] = ()  # kinds of depth truth; empty: there is but one
     static_ids: ClassVar[tuple[int, ...]] = ()  # instance ids that do not move with the scene
     name: ClassVar[str] = ""  # the file's stem
-    takes_further_labels: ClassVar[bool] = False  # the video stage's; then it is a keyword argument
+    takes_further_labels: ClassVar[bool] = False  # the video stage's
     layout: ClassVar[str] = ""  # what its files look like, in a sentence
     marks: ClassVar[str] = ""  # what a folder of it has, such as "leftImg8bit/"
     built_in: ClassVar[bool] = False  # rendered on first use; others need --data
@@ -165,9 +167,15 @@ class Dataset:
         needs: Collection[str] = (),
         training: bool = False,
         truth: str = "default",
+        further_labels: Path | None = None,
     ) -> None:
         self.root, self.split, self.data = root, split, data
         self.needs, self.training, self.truth = frozenset(needs), training, truth
+        self.further_labels = further_labels
+        if split not in self.splits:
+            raise ValueError(
+                f"{data.dataset} has no split '{split}': it has {', '.join(self.splits)}"
+            )
         unknown = self.needs - {NEIGHBOURS} - self.fields.keys()
         if unknown:
             raise ValueError(
@@ -178,8 +186,13 @@ class Dataset:
             raise ValueError(
                 f"{data.dataset} has no depth truth '{truth}': it has {', '.join(self.truths)}"
             )
+        self.open_split()
 
     # --- what a subclass says ---------------------------------------------------------------------
+
+    def open_split(self) -> None:
+        """Look up or make the split's frames: give them `names`, and keep what `read` needs."""
+        raise NotImplementedError
 
     def read(self, name: str) -> DecodedFrame:
         """Decode a frame: all at the input's size in training; truth at its own in evaluation."""

@@ -9,7 +9,7 @@ NYUv2's 795 frames, 595 of Cityscapes' 2975), and the folder `val`, which papers
 no split "val" then. Images are kept in 8 bits. Every file is checked as it is read.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -35,24 +35,15 @@ class ArrayFolders(Dataset):
     has_camera: ClassVar[bool] = False
     folders: ClassVar[Mapping[str, tuple[str, ...]]]  # of a field: the first of these that is there
 
-    def __init__(
-        self,
-        root: Path,
-        split: str,
-        data: Data,
-        *,
-        needs: Collection[str] = (),
-        training: bool = False,
-        truth: str = "default",
-    ) -> None:
-        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
+    def open_split(self) -> None:
+        data, split = self.data, self.split
         if NEIGHBOURS in self.needs:
             raise ValueError(f"{data.dataset} has single frames: no task can compare neighbours")
         if data.train_frames not in ("published", "all"):
             raise ValueError(
                 f"recipe.data.train_frames must be published or all, not '{data.train_frames}'"
             )
-        self.folder = root / FOLDER_OF[split]
+        self.folder = self.root / FOLDER_OF[split]
         self._paths = {name: self._folder_of(name) for name in sorted(self.needs)}
         names = stems(self.folder / IMAGE)
         held_out = validation(names)
@@ -71,7 +62,7 @@ class ArrayFolders(Dataset):
             if lacking:
                 raise ValueError(
                     f"{folder / lacking[0]}.npy: missing, one of {len(lacking)} frames without "
-                    f"{field}; see all with 'mtl-bench data check {root}'"
+                    f"{field}; see all with 'mtl-bench data check {self.root}'"
                 )
 
     @classmethod
@@ -82,12 +73,6 @@ class ArrayFolders(Dataset):
             root, data.height, data.width, 8, 2, 2, data.seed, progress=False, layout=cls.layout
         )
         return True
-
-    @classmethod
-    def render(cls, data: Data, quiet: bool = False) -> Path:
-        from mtl_bench.data import scenes
-
-        return scenes.ensure(data, progress=not quiet, layout=cls.layout)
 
     @classmethod
     def check(cls, root: Path, deep: bool = False) -> Report:

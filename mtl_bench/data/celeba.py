@@ -5,7 +5,7 @@ Source: Liu et al., ICCV 2015; `Img/img_align_celeba/*.jpg` (178x218), `Anno/lis
 recipe's size, 64x64 in the multi-task literature, as they are: neither cropped nor normalised.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 IMAGES = Path("Img") / "img_align_celeba"
 ATTRIBUTES = Path("Anno") / "list_attr_celeba.txt"
 PARTITION = Path("Eval") / "list_eval_partition.txt"
-SPLITS = ("train", "val", "test")
 SHOWN = 3  # examples of a problem
 
 
@@ -84,24 +83,12 @@ class CelebA(Dataset):
     fields: ClassVar[Mapping[str, Kind]] = dict.fromkeys(predicts["attributes"], Kind.VECTOR)
     published: ClassVar[Mapping[str, int]] = {"train": 162770, "val": 19867, "test": 19962}
 
-    def __init__(
-        self,
-        root: Path,
-        split: str,
-        data: Data,
-        *,
-        needs: Collection[str] = (),
-        training: bool = False,
-        truth: str = "default",
-    ) -> None:
-        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
-        if split not in SPLITS:
-            raise ValueError(f"{data.dataset} has no split '{split}': it has {', '.join(SPLITS)}")
-        self.faces = read_lists(root)
-        self.names = self.faces.of_split(split)
+    def open_split(self) -> None:
+        self.faces = read_lists(self.root)
+        self.names = self.faces.of_split(self.split)
         if not self.names:
-            raise ValueError(f"{root / PARTITION}: no image of the split {split}")
-        first = root / IMAGES / f"{self.names[0]}.jpg"
+            raise ValueError(f"{self.root / PARTITION}: no image of the split {self.split}")
+        first = self.root / IMAGES / f"{self.names[0]}.jpg"
         if not first.is_file():
             raise ValueError(f"{first}: missing; unpack img_align_celeba.zip")
 
@@ -139,7 +126,7 @@ class CelebA(Dataset):
         draw = np.random.default_rng(0)
         for place in (IMAGES, ATTRIBUTES.parent, PARTITION.parent):
             (root / place).mkdir(parents=True)
-        names = [f"{number:06}.jpg" for number in range(1, 12 * len(SPLITS) + 1)]
+        names = [f"{number:06}.jpg" for number in range(1, 12 * len(cls.splits) + 1)]
         has_N40 = draw.random((len(names), len(cls.fields))) < 0.4
         for name, has_40 in zip(names, has_N40, strict=True):
             image = draw.integers(0, 60, (218, 178, 3)) + 3 * int(has_40.sum())
@@ -165,7 +152,7 @@ class Faces:
     part_N: NDArray[np.int64]  # index of the split
 
     def of_split(self, split: str) -> list[str]:
-        part = SPLITS.index(split)
+        part = CelebA.splits.index(split)
         return [name for name, row in self.rows.items() if self.part_N[row] == part]
 
 
@@ -280,7 +267,7 @@ def check(root: Path, deep: bool = False) -> CelebAReport:
     report.share = dict(zip(CelebA.fields, faces.has_N40.mean(0).tolist(), strict=True))
     folder = root / IMAGES
     there = {path.stem for path in folder.glob("*.jpg")}
-    for split in SPLITS:
+    for split in CelebA.splits:
         names = faces.of_split(split)
         present = [name for name in names if name in there]
         report.present[split] = (len(present), len(names))

@@ -4,7 +4,7 @@ Frames larger than the recipe's input are shrunk to it, intrinsics and labels wi
 reading, or once where `mtl-bench data cache` wrote them down.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames, Report
-from mtl_bench.core.recipe import Data, Recipe
+from mtl_bench.core.recipe import Recipe
 from mtl_bench.data import cityscapes_files as files
 from mtl_bench.data import frame_cache
 from mtl_bench.data.augment import scale
@@ -50,32 +50,20 @@ class Cityscapes(Dataset):
     marks = "leftImg8bit/"
     published: ClassVar[Mapping[str, int]] = {"train": 2975, "val": 500, "test": 1525}
 
-    def __init__(
-        self,
-        root: Path,
-        split: str,
-        data: Data,
-        *,
-        needs: Collection[str] = (),
-        training: bool = False,
-        truth: str = "default",
-        further_labels: Path | None = None,
-    ) -> None:
-        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
-        self.further_labels = further_labels
-        self.on_disk = FrameCache(root, data, self._to_input)
-        self.names = files.annotated_names(root, split)
+    def open_split(self) -> None:
+        self.on_disk = FrameCache(self.root, self.data, self._to_input)
+        self.names = files.annotated_names(self.root, self.split)
         self._annotated = frozenset(self.names)
         self._label_files = self._find_labels()
-        if further_labels:
+        if self.further_labels:
             self.names = self._with_sequence_frames()
-        mask_path = root / files.EGO_MASK.suffix
+        mask_path = self.root / files.EGO_MASK.suffix
         masked = self._compares and not self._annotated <= self._label_files.keys()
         self._ego_mask = files.read_ego_mask(mask_path) if masked and mask_path.exists() else None
         self._camera_names = self._find_cameras()
         self._require_files()
         self._standing = 0  # frames that are left out
-        if self._compares and data.min_flow > 0:
+        if self._compares and self.data.min_flow > 0:
             self._leave_out_standing()
 
     @classmethod

@@ -7,36 +7,29 @@ split, so three fifths of the digits, drawn by the data's seed, make training pa
 each those of validation and test. No digit is in two splits.
 """
 
-import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mtl_bench.core.dataset import Dataset, DecodedFrame, Kind
+from mtl_bench.core.dataset import DecodedFrame, Kind
 from mtl_bench.core.labels import Label, LabelSet
 from mtl_bench.core.plugins import lack
-from mtl_bench.core.recipe import Data
+from mtl_bench.data._in_memory import InMemory
 
-SPLITS = ("train", "val", "test")
 SHARES = (0.6, 0.8)  # of the digits: where training ends, and validation
 SIZE = 8  # pixels of a digit
 SHIFT = 4  # pixels between the two, both ways
-MADE_FROM = ("height", "width", "train_scenes", "val_scenes", "test_scenes", "seed")
-IN_MEMORY = Path(__file__).resolve().parent  # stands for a folder; nothing is read from it
 
 
-class Digits(Dataset):
+class Digits(InMemory):
     """Grey images of two digits each; what the left and the right one are, and how they look."""
 
-    built_in = True
-    has_camera = False
     labels = LabelSet("digits", tuple(Label(str(d), d, False, (25 * d, 90, 90)) for d in range(10)))
-    layout, marks = "Digits that scikit-learn brings", ""
+    layout = "Digits that scikit-learn brings"
     predicts: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "classify": ("left", "right"),
         "reconstruct": ("left_picture", "right_picture"),
@@ -46,31 +39,20 @@ class Digits(Dataset):
         **dict.fromkeys(predicts["reconstruct"], Kind.PICTURE),
     }
 
-    def __init__(
-        self,
-        root: Path,
-        split: str,
-        data: Data,
-        *,
-        needs: Collection[str] = (),
-        training: bool = False,
-        truth: str = "default",
-    ) -> None:
-        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
-        if split not in SPLITS:
-            raise ValueError(f"{data.dataset} has no split '{split}': it has {', '.join(SPLITS)}")
-        least = SIZE + SHIFT
+    def open_split(self) -> None:
+        data, least = self.data, SIZE + SHIFT
         if min(data.height, data.width) < least:
             raise ValueError(
                 f"recipe.data.height x width = {data.height}x{data.width}: two digits take "
                 f"{least}x{least} pixels"
             )
         pictures_N88, classes_N = _bundled()
-        place, count = SPLITS.index(split), (data.train_scenes, data.val_scenes, data.test_scenes)
+        place = self.splits.index(self.split)
+        count = (data.train_scenes, data.val_scenes, data.test_scenes)[place]
         order = np.random.default_rng([data.seed, 0]).permutation(len(pictures_N88))
         ends = [0, *(round(share * len(order)) for share in SHARES), len(order)]
         own = order[ends[place] : ends[place + 1]]
-        pairs_N2 = np.random.default_rng([data.seed, 1, place]).choice(own, (count[place], 2))
+        pairs_N2 = np.random.default_rng([data.seed, 1, place]).choice(own, (count, 2))
         self.pictures_N2HW = np.zeros((len(pairs_N2), 2, data.height, data.width), np.uint8)
         top, left = (data.height - least) // 2, (data.width - least) // 2
         for side, shift in enumerate((0, SHIFT)):
@@ -79,7 +61,7 @@ class Digits(Dataset):
                 pairs_N2[:, side]
             ]
         self.classes_N2 = classes_N[pairs_N2]
-        self.names = [f"{split}{number}" for number in range(len(pairs_N2))]
+        self.names = [f"{self.split}{number}" for number in range(len(pairs_N2))]
 
     def read(self, name: str) -> DecodedFrame:
         index = int(name.removeprefix(self.split))
@@ -93,23 +75,6 @@ class Digits(Dataset):
             images_N3HW=[pictures_2HW.amax(0).expand(3, -1, -1)],
             fields={key: value for key, value in fields.items() if key in self.needs},
         )
-
-    @classmethod
-    def recognises(cls, root: Path) -> bool:
-        return root.resolve() == IN_MEMORY
-
-    @classmethod
-    def made_from(cls, data: Data, root: Path | None) -> str:
-        """What the pairs depend on."""
-        return json.dumps([cls.name, *(getattr(data, key) for key in MADE_FROM)])
-
-    def paths(self) -> list[Path]:
-        """No file is read."""
-        return []
-
-    @classmethod
-    def render(cls, data: Data, quiet: bool = False) -> Path:
-        return IN_MEMORY
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,7 @@ keeps the shape and pads to 384 x 1280 instead). Ground truth stays at the frame
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, LabelFrames, Report
-from mtl_bench.core.recipe import Data, Recipe
+from mtl_bench.core.recipe import Recipe
 from mtl_bench.data import frame_cache, velodyne
 from mtl_bench.data import kitti_files as files
 from mtl_bench.data import kitti_splits as splits
@@ -81,31 +81,22 @@ class Kitti(Dataset):
     layout = "KITTI raw"
     marks = "days such as 2011_09_26/"
 
-    def __init__(
-        self,
-        root: Path,
-        split: str,
-        data: Data,
-        *,
-        needs: Collection[str] = (),
-        training: bool = False,
-        truth: str = "default",
-    ) -> None:
-        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
-        self.on_disk = FrameCache(root, data, self._to_input)
+    def open_split(self) -> None:
+        root = self.root
+        self.on_disk = FrameCache(root, self.data, self._to_input)
         self.tree = files.Tree(root)
         self.left_out: Counter[str] = Counter()
         frames = self._present()
-        if self._compares and data.min_flow > 0:
+        if self._compares and self.data.min_flow > 0:
             frames = self._moving(frames)
         if "depth_m" in self.needs:
-            frames = self._with_truth(frames, truth)
+            frames = self._with_truth(frames, self.truth)
         self._frames = {frame.name: frame for frame in frames}
         self.names = list(self._frames)
         self._label_files = {
             frame.name: self.tree.labels(frame) for frame in frames if self.tree.has_labels(frame)
         }
-        if training and "instance_ids" in self.needs:
+        if self.training and "instance_ids" in self.needs:
             self._require_labels()
         self._cameras = {
             (date, camera): files.read_camera(root / date, camera)

@@ -39,7 +39,7 @@ def open_samples(
         truth: which of the data set's truths to evaluate on.
 
     Raises:
-        ValueError: an unknown data set, one that lacks what the tasks need, or such a folder.
+        ValueError: an unknown data set, or one that lacks what the tasks need.
     """
     kind = dataset_of(recipe)
     for task in tasks:
@@ -48,8 +48,15 @@ def open_samples(
                 f"task '{task.name}' reads the camera, and {recipe.data.dataset} has none"
             )
     needs = frozenset().union(*(task.needs if training else task.truth for task in tasks))
-    more = {} if further_labels is None else {"further_labels": further_labels}
-    dataset = kind(root, split, recipe.data, needs=needs, training=training, truth=truth, **more)
+    dataset = kind(
+        root,
+        split,
+        recipe.data,
+        needs=needs,
+        training=training,
+        truth=truth,
+        further_labels=further_labels,
+    )
     targets = [task.targets for task in tasks]
     keep = frozenset().union(*(task.reads for task in tasks))
     return Samples(dataset, recipe.augment if training else None, targets, keep)

@@ -7,58 +7,38 @@ products, which no features but learned ones explain, and some noise; the input 
 noise.
 """
 
-import json
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mtl_bench.core.dataset import Dataset, DecodedFrame, Kind
+from mtl_bench.core.dataset import DecodedFrame, Kind
 from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.recipe import Data
+from mtl_bench.data._in_memory import InMemory
 
-SPLITS = ("train", "val", "test")
 UNITS = 4  # of a function: two products
 NOISE = 0.1  # share of the variance that nothing explains, so that changes in percent stay small
 OWN = 0.7  # of a function's directions that no other has, against the shared part
 Functions = Callable[[NDArray[np.float64], Data], NDArray[np.float64]]
-MADE_FROM = (
-    *("height", "width", "train_scenes", "val_scenes", "test_scenes", "seed"),
-    *("heads", "cosine", "norm_ratio"),
-)
-IN_MEMORY = Path(__file__).resolve().parent  # stands for a folder; nothing is read from it
 
 
-class Scales(Dataset):
+class Scales(InMemory):
     """Images whose pixels are numbers, and up to ten numbers to regress."""
 
-    built_in = True
-    has_camera = False
+    made_of = (*InMemory.made_of, "heads", "cosine", "norm_ratio")
     labels = LabelSet("numbers", ())
-    layout, marks = "Numbers that are made from a seed", ""
+    layout = "Numbers that are made from a seed"
     predicts: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "regress": ("y0", "y1", "y2", "y3", "y4", "y5", "y6", "y7", "y8", "y9")
     }
     fields: ClassVar[Mapping[str, Kind]] = dict.fromkeys(predicts["regress"], Kind.VECTOR)
 
-    def __init__(
-        self,
-        root: Path,
-        split: str,
-        data: Data,
-        *,
-        needs: Collection[str] = (),
-        training: bool = False,
-        truth: str = "default",
-    ) -> None:
-        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
-        if split not in SPLITS:
-            raise ValueError(f"{data.dataset} has no split '{split}': it has {', '.join(SPLITS)}")
-        names = self.predicts["regress"]
+    def open_split(self) -> None:
+        data, names = self.data, self.predicts["regress"]
         if not 2 <= data.heads <= len(names):
             raise ValueError(f"recipe.data.heads = {data.heads}: from 2 to {len(names)}")
         lacking = sorted(self.needs - {*names[: data.heads]})
@@ -66,10 +46,10 @@ class Scales(Dataset):
             raise ValueError(
                 f"{data.dataset} with recipe.data.heads = {data.heads} has no {lacking[0]}"
             )
-        self.pixels_N3HW, functions_NK = _made(self.functions, data, split)
+        self.pixels_N3HW, functions_NK = _made(self.functions, data, self.split)
         scale_K = data.norm_ratio ** np.linspace(-0.5, 0.5, data.heads)
         self.truth_NK = torch.from_numpy((functions_NK * scale_K).astype(np.float32))
-        self.names = [f"{split}{number}" for number in range(len(self.truth_NK))]
+        self.names = [f"{self.split}{number}" for number in range(len(self.truth_NK))]
 
     @staticmethod
     def functions(x_ND: NDArray[np.float64], data: Data) -> NDArray[np.float64]:
@@ -87,23 +67,6 @@ class Scales(Dataset):
             images_N3HW=[self.pixels_N3HW[index]],
             fields={key: value for key, value in numbers.items() if key in self.needs},
         )
-
-    @classmethod
-    def recognises(cls, root: Path) -> bool:
-        return root.resolve() == IN_MEMORY
-
-    @classmethod
-    def made_from(cls, data: Data, root: Path | None) -> str:
-        """What the numbers depend on."""
-        return json.dumps([cls.name, *(getattr(data, key) for key in MADE_FROM)])
-
-    def paths(self) -> list[Path]:
-        """No file is read."""
-        return []
-
-    @classmethod
-    def render(cls, data: Data, quiet: bool = False) -> Path:
-        return IN_MEMORY
 
 
 def products(directions_KDU: NDArray[np.float64], x_ND: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -126,6 +89,6 @@ def _made(functions: Functions, data: Data, split: str) -> tuple[torch.Tensor, N
     functions_NK = (functions_NK - training.mean(0)) / training.std(0)
     noise_NK = np.random.default_rng([data.seed, 2]).standard_normal(functions_NK.shape)
     functions_NK = (1 - NOISE) ** 0.5 * functions_NK + NOISE**0.5 * noise_NK
-    chosen = SPLITS.index(split)
+    chosen = Scales.splits.index(split)
     of_split = slice(sum(counts[:chosen]), sum(counts[: chosen + 1]))
     return torch.from_numpy(pixels[of_split]), functions_NK[of_split]

@@ -6,11 +6,11 @@ Source: `scenes/`, rendered into the user's cache by seed and number of the scen
 
 from typing import ClassVar
 
+from mtl_bench.data._rendered import Rendered
 from mtl_bench.data.cityscapes_mtan import CityscapesMtan
 
 
-class SyntheticCityscapesMtan(CityscapesMtan):
+class SyntheticCityscapesMtan(Rendered, CityscapesMtan):
     """Street scenes, rendered on first use; what the numbers say is of them alone."""
 
-    built_in: ClassVar[bool] = True
     published: ClassVar[dict[str, int]] = {}

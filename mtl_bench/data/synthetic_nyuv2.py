@@ -8,13 +8,13 @@ test scenes.
 
 from typing import ClassVar
 
+from mtl_bench.data._rendered import Rendered
 from mtl_bench.data.nyuv2 import Nyuv2
 from mtl_bench.data.scenes.arrays import STREET13
 
 
-class SyntheticNyuv2(Nyuv2):
+class SyntheticNyuv2(Rendered, Nyuv2):
     """Street scenes, rendered on first use; what the numbers say is of them alone."""
 
     labels = STREET13
-    built_in: ClassVar[bool] = True
     published: ClassVar[dict[str, int]] = {}

@@ -468,7 +468,7 @@ def test_empty_splits_and_no_tree_at_all(tree, tmp_path):
         shutil.rmtree(tree / drive[:10] / drive)
     refused("none of the 39810 frames .*train_frames=all to train", lambda: open_tree(tree))
     refused("none of the 697 frames of the split test; unpack", lambda: open_tree(tree, "test"))
-    refused("no split 'tset' of KITTI; there are train, val, test", lambda: open_tree(tree, "tset"))
+    refused("has no split 'tset': it has train, val, test", lambda: open_tree(tree, "tset"))
     shutil.rmtree(tree / "2011_09_26" / VAL)
     data = config.Data(dataset="kitti", train_frames="all")
     refused("no frame to train on that has both", lambda: open_tree(tree, data=data))

@@ -28,12 +28,12 @@ class Rooms(Dataset):
     fields = {"instance_ids": Kind.IDS, "depth_m": Kind.DEPTH}
     layout, marks = "Rooms", CAMERA
 
-    def __init__(self, root, split, data, *, needs=(), training=False, truth="default"):
-        super().__init__(root, split, data, needs=needs, training=training, truth=truth)
-        self.names = sorted(path.stem for path in (root / split).glob("*.jpg"))
+    def open_split(self):
+        folder = self.root / self.split
+        self.names = sorted(path.stem for path in folder.glob("*.jpg"))
         if not self.names:
-            raise ValueError(f"{root / split}: no *.jpg in it")
-        fx, fy, cx, cy, self.height_m = np.loadtxt(root / CAMERA)
+            raise ValueError(f"{folder}: no *.jpg in it")
+        fx, fy, cx, cy, self.height_m = np.loadtxt(self.root / CAMERA)
         self.K_33 = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
 
     @classmethod
