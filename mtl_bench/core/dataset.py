@@ -172,10 +172,7 @@ class Dataset:
         self.root, self.split, self.data = root, split, data
         self.needs, self.training, self.truth = frozenset(needs), training, truth
         self.further_labels = further_labels
-        if split not in self.splits:
-            raise ValueError(
-                f"{data.dataset} has no split '{split}': it has {', '.join(self.splits)}"
-            )
+        self.split_index(split)  # it is one
         unknown = self.needs - {NEIGHBOURS} - self.fields.keys()
         if unknown:
             raise ValueError(
@@ -197,6 +194,20 @@ class Dataset:
     def read(self, name: str) -> DecodedFrame:
         """Decode a frame: all at the input's size in training; truth at its own in evaluation."""
         raise NotImplementedError
+
+    @classmethod
+    def split_index(cls, split: str) -> int:
+        """Its place in `splits`.
+
+        Raises:
+            ValueError: no such split.
+        """
+        if split not in cls.splits:
+            raise ValueError(
+                f"{cls.name.replace('_', '-') or cls.layout} has no split '{split}': it has "
+                f"{', '.join(cls.splits)}"
+            )
+        return cls.splits.index(split)
 
     @classmethod
     def recognises(cls, root: Path) -> bool:

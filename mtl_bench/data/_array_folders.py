@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mtl_bench.core.dataset import NEIGHBOURS, Dataset, DecodedFrame, Kind, Report
 from mtl_bench.core.labels import IGNORE
 from mtl_bench.core.recipe import Data
+from mtl_bench.data import npy
 
 IMAGE = "image"  # the folder; other folders are fields
 FOLDER_OF = {"train": "train", "val": "train", "test": "val"}  # of a split
@@ -161,14 +162,7 @@ def load(path: Path, channels: int) -> NDArray[Any]:
     Raises:
         ValueError: no such file, no array, or one of another shape or type.
     """
-    try:
-        array = np.load(path, allow_pickle=False)
-    except FileNotFoundError:
-        raise ValueError(f"{path}: missing") from None
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: not a whole .npy array ({error})") from None
-    if array.dtype.kind not in "fiub":
-        raise ValueError(f"{path}: values of type {array.dtype}, not numbers")
+    array = npy.read(path)
     if channels == 1 and array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
     if array.ndim != (2 if channels == 1 else 3) or (channels > 1 and array.shape[2] != channels):
@@ -177,8 +171,7 @@ def load(path: Path, channels: int) -> NDArray[Any]:
         )
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{path}: values that are not finite; 0 marks what has none")
-    found: NDArray[Any] = array
-    return found
+    return array
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:

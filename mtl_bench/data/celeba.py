@@ -152,7 +152,7 @@ class Faces:
     part_N: NDArray[np.int64]  # index of the split
 
     def of_split(self, split: str) -> list[str]:
-        part = CelebA.splits.index(split)
+        part = CelebA.split_index(split)
         return [name for name, row in self.rows.items() if self.part_N[row] == part]
 
 

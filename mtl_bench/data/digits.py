@@ -47,7 +47,7 @@ class Digits(InMemory):
                 f"{least}x{least} pixels"
             )
         pictures_N88, classes_N = _bundled()
-        place = self.splits.index(self.split)
+        place = self.split_index(self.split)
         count = (data.train_scenes, data.val_scenes, data.test_scenes)[place]
         order = np.random.default_rng([data.seed, 0]).permutation(len(pictures_N88))
         ends = [0, *(round(share * len(order)) for share in SHARES), len(order)]

@@ -64,6 +64,8 @@ def tree_of(
     out.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(out.with_name(f"{out.name}.lock")):
         if not out.is_dir():
+            for remains in out.parent.glob(f"{out.name}.partial-*"):  # of killed runs
+                shutil.rmtree(remains, ignore_errors=True)
             partial = out.with_name(f"{out.name}.partial-{secrets.token_hex(4)}")
             try:
                 _write(partial, Reader(video), camera, progress)

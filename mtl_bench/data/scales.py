@@ -89,6 +89,6 @@ def _made(functions: Functions, data: Data, split: str) -> tuple[torch.Tensor, N
     functions_NK = (functions_NK - training.mean(0)) / training.std(0)
     noise_NK = np.random.default_rng([data.seed, 2]).standard_normal(functions_NK.shape)
     functions_NK = (1 - NOISE) ** 0.5 * functions_NK + NOISE**0.5 * noise_NK
-    chosen = Scales.splits.index(split)
+    chosen = Scales.split_index(split)
     of_split = slice(sum(counts[:chosen]), sum(counts[: chosen + 1]))
     return torch.from_numpy(pixels[of_split]), functions_NK[of_split]

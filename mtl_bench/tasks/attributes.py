@@ -45,9 +45,7 @@ class Attributes(Task):
         return {"has": maps["logit"][:, 0] > 0}
 
     def metrics(self, split: str | None = None) -> list[Metric]:
-        metric = Confusion(self.field)
-        metric.split = split or self.recipe.evaluate.split
-        return [metric]
+        return [Confusion(self.field, split or self.recipe.evaluate.split)]
 
     def trivial(self, size: Size) -> "Yes":
         return Yes()
@@ -56,8 +54,9 @@ class Attributes(Task):
 class Confusion(Metric):
     """Counts of found and true, over the split."""
 
-    def __init__(self, field: str) -> None:
-        self.field, self.counts_22 = field, np.zeros((2, 2), np.int64)  # true, found
+    def __init__(self, field: str, split: str) -> None:
+        self.field, self.split = field, split
+        self.counts_22 = np.zeros((2, 2), np.int64)  # true, found
 
     def update(self, truth: Frame, result: Frame) -> Frame:
         self.counts_22[int(truth[self.field][0]), int(result["has"])] += 1

@@ -51,9 +51,7 @@ class Classify(Task):
         return {"class": maps["logits"].argmax(1)}
 
     def metrics(self, split: str | None = None) -> list[Metric]:
-        metric = Accuracy(self.field)
-        metric.split = split or self.recipe.evaluate.split
-        return [metric]
+        return [Accuracy(self.field, split or self.recipe.evaluate.split)]
 
     def trivial(self, size: Size) -> "Most":
         return Most(self.field)
@@ -62,8 +60,8 @@ class Classify(Task):
 class Accuracy(Metric):
     """Share of the frames whose class is right."""
 
-    def __init__(self, field: str) -> None:
-        self.field, self.sums = field, np.zeros(2, np.int64)  # right ones, all
+    def __init__(self, field: str, split: str) -> None:
+        self.field, self.split, self.sums = field, split, np.zeros(2, np.int64)  # right ones, all
 
     def update(self, truth: Frame, result: Frame) -> Frame:
         self.sums += (int(result["class"]) == int(truth[self.field][0]), 1)

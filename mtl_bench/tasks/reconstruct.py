@@ -65,9 +65,7 @@ class Reconstruct(Task):
         return {"grey": maps["grey"][:, 0]}
 
     def metrics(self, split: str | None = None) -> list[Metric]:
-        metric = PictureError(self.field)
-        metric.split = split or self.recipe.evaluate.split
-        return [metric]
+        return [PictureError(self.field, split or self.recipe.evaluate.split)]
 
     def trivial(self, size: Size) -> "MeanPicture":
         return MeanPicture(self.field)
@@ -93,12 +91,10 @@ class PictureHead(TaskHead):
 class PictureError(Metric):
     """Squared errors over all pixels of the split, and the truth's own mean and variance there."""
 
-    def __init__(self, field: str) -> None:
-        self.field = field
+    def __init__(self, field: str, split: str) -> None:
+        self.field, self.split = field, split
         self.sums = np.zeros(2)  # frames; squared errors, each the mean of a frame's
-        self.pixels_2HW: NDArray[np.float64] = np.zeros(
-            (2, 1, 1)
-        )  # sums of truth and of its square
+        self.pixels_2HW = np.zeros((2, 1, 1))  # sums of the truth and of its square
 
     def update(self, truth: Frame, result: Frame) -> Frame:
         true_HW = truth[self.field].astype(np.float64)

@@ -49,9 +49,7 @@ class Regress(Task):
         return {"number": maps["number"]}
 
     def metrics(self, split: str | None = None) -> list[Metric]:
-        metric = SquaredError(self.field)
-        metric.split = split or self.recipe.evaluate.split
-        return [metric]
+        return [SquaredError(self.field, split or self.recipe.evaluate.split)]
 
     def trivial(self, size: Size) -> "Mean":
         return Mean(self.field)
@@ -60,8 +58,8 @@ class Regress(Task):
 class SquaredError(Metric):
     """Sums over the split of 1, the truth, its square and the squared error."""
 
-    def __init__(self, field: str) -> None:
-        self.field, self.sums = field, np.zeros(4)
+    def __init__(self, field: str, split: str) -> None:
+        self.field, self.split, self.sums = field, split, np.zeros(4)
 
     def update(self, truth: Frame, result: Frame) -> Frame:
         true, found = float(truth[self.field][0]), float(result["number"][0])

@@ -25,7 +25,7 @@ from mtl_bench.core.recipe import Evaluate, Network
 from mtl_bench.core.task import Frame, MapInfo, Maps, Metric, Results, Size, Task, TaskHead, Trivial
 from mtl_bench.core.terms import Term
 from mtl_bench.core.view import METRES, STEPS
-from mtl_bench.data import png
+from mtl_bench.data import npy, png
 from mtl_bench.model.layers import Decoder, Head, full
 from mtl_bench.tasks import pixels
 from mtl_bench.tasks.depth import protocols
@@ -254,7 +254,7 @@ class Depth(Task):
 
         Pixels without a value take the nearest one's, as KITTI's evaluator fills them.
         """
-        depth_HW = _array(path) if path.suffix == ".npy" else png.read(path, 16) / STEPS
+        depth_HW = npy.read(path) if path.suffix == ".npy" else png.read(path, 16) / STEPS
         known_HW = np.isfinite(depth_HW) & (depth_HW > 0)
         if depth_HW.ndim != 2 or not known_HW.any():
             raise ValueError(f"{path}: no depth of a pixel in it, or not one map [H,W]")
@@ -288,14 +288,6 @@ class Depth(Task):
     @classmethod
     def drawn_view(cls, name: str, map_HW: NDArray[Any], labels: LabelSet) -> DepthView:
         return DepthView(np.asarray(map_HW, np.float32), METRES)
-
-
-def _array(path: Path) -> NDArray[Any]:
-    try:
-        found: NDArray[Any] = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: no .npy file of numbers ({error})") from error
-    return found
 
 
 def _classes(results: Mapping[str, Results], key: str) -> Tensor | None:
