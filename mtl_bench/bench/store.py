@@ -158,6 +158,15 @@ def changed(before: Mapping[str, Any], job: Job, data: Data | None = None) -> di
     return found
 
 
+def data_for(needed: Job, cell: Cell, data: Data | None) -> Data | None:
+    """What a cell that another needs is compared with: what both are trained on.
+
+    None for what a cell continues, which may be of another data set or folder.
+    """
+    before = with_parents([] if cell.continues is None else [cell.continues])
+    return None if needed.id in [each.id for each in before] else data
+
+
 def rows(
     jobs: Iterable[Job],
     runs: Path,

@@ -208,7 +208,8 @@ def _definitions(target: Target) -> Iterator[tuple[Path, str]]:
 # --- files ----------------------------------------------------------------------------------------
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
+def stamp(path: Path) -> tuple[int, int] | None:
+    """When a file was written, and its size; None where there is none."""
     try:
         status = path.stat()
     except OSError:  # gone, or a link that leads nowhere
@@ -218,7 +219,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 def forget_edited() -> None:
     """Read all files anew if one of them was edited."""
-    if any(_stamp(path) != stamp for path, (stamp, _) in _modules.items()):
+    if any(stamp(path) != seen for path, (seen, _) in _modules.items()):
         _modules.clear()
         _known.clear()
 
@@ -226,7 +227,7 @@ def forget_edited() -> None:
 def load(path: Path) -> "Module":
     """A file as it was when this process first saw it, or saw that any had been edited."""
     if path not in _modules:
-        _modules[path] = _stamp(path), Module(path)
+        _modules[path] = stamp(path), Module(path)
     return _modules[path][1]
 
 
