@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.bench.data_state import Data
+from mtl_bench.bench.data_state import STAGES, Data
 from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_parents
 from mtl_bench.core import provenance
 from mtl_bench.core.config import Cell
@@ -298,7 +298,7 @@ def unsure(stale: Mapping[str, str]) -> bool:
 
     Not so where the files of training alone were written anew: that one would not see them.
     """
-    return all(stale.get(stage) in provenance.UNSURE for stage in ("train", "evaluate"))
+    return all(stale.get(stage) in provenance.UNSURE for stage in STAGES)
 
 
 def set_aside(directory: Path, why: str) -> str:
