@@ -17,7 +17,14 @@ from typing import Annotated, Any, Generic, TypeAlias, TypeVar
 
 from mtl_bench.core import plugins, provenance
 from mtl_bench.core.columns import FPS
-from mtl_bench.core.config import Cell, Recipe, check_cells, load_recipe
+from mtl_bench.core.config import (
+    Cell,
+    Recipe,
+    check_cells,
+    check_tasks,
+    leave_out_defaults,
+    load_recipe,
+)
 from mtl_bench.core.files import read_json
 from mtl_bench.core.fingerprint import STAGES, Root, fingerprints, of_package
 from mtl_bench.core.plain import (
@@ -35,7 +42,8 @@ from mtl_bench.deploy import engines
 
 PROTOCOL = 1  # raised when times taken before stop being comparable with times taken after
 NOTHING: Mapping[str, Any] = MappingProxyType({})
-LATER = (("network", "decoder"),)  # as in core/config.py, of recipes' values that timings have
+# Of `config.LATER`, what timings have had from their first day
+KEPT = (("evaluate", "protocol"), ("evaluate", "also"), ("evaluate", "flip"))
 SIZE = re.compile(r"([1-9]\d*)x([1-9]\d*)")
 
 
@@ -112,10 +120,7 @@ def canonical_json(timing: Timing) -> str:
     """
     recipe = to_dict(recipe_of(timing))
     values = to_dict(timing) | {key: recipe[key] for key in ("network", "evaluate")}
-    defaults = to_dict(Recipe())
-    for section, key in LATER:
-        if values[section][key] == defaults[section][key]:
-            del values[section][key]
+    leave_out_defaults(values, KEPT)
     del values["recipe"]
     if timing.weights is not None:
         values["weights"] = load_cell(Path(timing.weights) / "cell.json").id
@@ -333,8 +338,7 @@ class Timings(Kind[Timing]):
     def check(self, jobs: Iterable[Timing]) -> None:
         for timing in jobs:
             plugins.path_of("engines", timing.engine)
-            for task in timing.tasks:
-                plugins.path_of("tasks", task)
+            check_tasks(timing.tasks)
             plugins.path_of("backbones", timing.backbone)
             arguments = timing.backbone_args
             known = plugins.arguments("backbones", timing.backbone) if arguments else {}

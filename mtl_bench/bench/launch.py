@@ -455,7 +455,7 @@ class Here:
         """
         for parent in with_parents(cell.parents):
             assert isinstance(parent, Cell)
-            state = store.inspect(parent, self.runs, self.data)
+            state = store.inspect(parent, self.runs, store.data_for(parent, cell, self.data))
             if state.word == "stale" and not state.trained:
                 again = f"mtl-bench train {store.run_dir(parent, self.runs)}/cell.json --stale"
                 raise ValueError(f"a cell that this one needs is stale, {state.why}: {again}")
@@ -469,10 +469,8 @@ class Here:
         with claim(directory):
             if rerun:
                 store.clear(directory)
-            elif line := store.done_already(
-                cell, self.runs, stale, self.data
-            ):  # meanwhile, by another
-                self.echo(line)
+            elif line := store.done_already(cell, self.runs, stale, self.data):
+                self.echo(line)  # meanwhile, by another
                 return
             renewed = stale and store.can_renew(cell, self.runs, self.data)
             with _recorded(directory):

@@ -19,8 +19,7 @@ SEEDS = 10  # of the quality beside the speed: those below this that are done ar
 def trivial(grid: Grid, runs: Path) -> dict[str, Any] | None:
     """Metrics of the trivial predictors on the grid's data set, where they were measured."""
     file = _trivial_file(grid, runs)
-    found: dict[str, Any] | None = None if file is None else read_json(file)
-    return found
+    return None if file is None else read_json(file)
 
 
 def measure_trivial(
@@ -36,11 +35,11 @@ def measure_trivial(
     file = _trivial_file(grid, runs)
     if file is None or (file.is_file() and not refresh):
         return
-    from mtl_bench.evaluate.trivial import baselines
+    from mtl_bench.evaluate.trivial import baselines as measure
 
     file.parent.mkdir(parents=True, exist_ok=True)
     cell = replace(grid.cells[0], tasks=_tasks(grid), video=False, single_task=False)
-    write_json(file, baselines(cell, root(), file.parent).metrics)
+    write_json(file, measure(cell, root(), file.parent).metrics)
 
 
 def _trivial_file(grid: Grid, runs: Path) -> Path | None:
@@ -78,10 +77,9 @@ def baseline_row(grid: Grid, row: Mapping[str, Any], runs: Path) -> dict[str, An
 
 
 def baseline_rows(grid: Grid, runs: Path) -> list[dict[str, Any]]:
-    """The stored rows that deltas of the grid's rows are against."""
-    cells = {cell.id: cell for cell in (baseline_cell(c, grid.baseline) for c in grid.cells)}
+    """The rows of those cells that are not the grid's own."""
     own = {cell.id for cell in grid.cells}
-    return store.rows([cell for id_, cell in cells.items() if id_ not in own], runs)
+    return store.rows([cell for cell in baselines(grid) if cell.id not in own], runs)
 
 
 def quality(grid: Grid, runs: Path) -> list[dict[str, Any]]:

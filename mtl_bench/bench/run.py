@@ -194,7 +194,7 @@ def _train(
     start = further_labels = None
     protocol = {}
     for parent in cell.parents:
-        _, start = _result_of(parent, run_dir.parent, data)
+        _, start = _result_of(parent, run_dir.parent, store.data_for(parent, cell, data))
     if cell.video:
         assert start is not None
         further_labels, frames = _pseudo_labels(
@@ -254,7 +254,7 @@ def _trained_apart(cell: Cell, run_dir: Path, compute: Compute, data: Data) -> T
     return Trained(load_model(cell, run_dir / CHECKPOINT, compute), took, {})
 
 
-def _result_of(parent: Cell, runs: Path, data: Data) -> tuple[dict[str, Any], Path]:
+def _result_of(parent: Cell, runs: Path, data: Data | None) -> tuple[dict[str, Any], Path]:
     """Row and checkpoint of a cell that another needs.
 
     Raises:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mtl_bench.bench.data_state import Data
+from mtl_bench.bench.data_state import STAGES, Data
 from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_parents
 from mtl_bench.core import provenance
 from mtl_bench.core.config import Cell
@@ -156,6 +156,15 @@ def changed(before: Mapping[str, Any], job: Job, data: Data | None = None) -> di
         for stage, why in data.changes(job, before.get("data")).items():
             found[stage] = why if found.get(stage, why) == why else f"{found[stage]}, {why}"
     return found
+
+
+def data_for(needed: Job, cell: Cell, data: Data | None) -> Data | None:
+    """What a cell that another needs is compared with: what both are trained on.
+
+    None for what a cell continues, which may be of another data set or folder.
+    """
+    before = with_parents([] if cell.continues is None else [cell.continues])
+    return None if needed.id in [each.id for each in before] else data
 
 
 def rows(
@@ -289,7 +298,7 @@ def unsure(stale: Mapping[str, str]) -> bool:
 
     Not so where the files of training alone were written anew: that one would not see them.
     """
-    return all(stale.get(stage) in provenance.UNSURE for stage in ("train", "evaluate"))
+    return all(stale.get(stage) in provenance.UNSURE for stage in STAGES)
 
 
 def set_aside(directory: Path, why: str) -> str:

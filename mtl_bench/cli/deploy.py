@@ -186,13 +186,12 @@ def _network(
     settings: list[str] | None,
 ) -> "tuple[Cell, Model]":
     """What to run: a checkpoint's network, or one with random weights."""
-    from mtl_bench.core import plugins as found
+    from mtl_bench.core.config import check_tasks
 
     if (checkpoint is None) == (backbone is None):
         raise ValueError("say which network: either --checkpoint RUN or --backbone NAME")
     names = o.names(tasks)
-    for name in names:
-        found.path_of("tasks", name)
+    check_tasks(names)
     if checkpoint is not None:
         if recipe is not None or settings:
             raise ValueError("--recipe and --set go with --backbone: a checkpoint has its own")

@@ -8,7 +8,7 @@ the same id, whatever file or option the values came from.
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -45,6 +45,7 @@ __all__ += [
     "Recipe",
     "canonical_json",
     "check_cells",
+    "check_tasks",
     "load_recipe",
     "override",
     "training_json",
@@ -57,7 +58,7 @@ GRANULARITIES = ("terms", "tasks")
 FROZEN = "frozen"  # a setting of every backbone: "stem" or "all" of it does not learn
 HASHED = "sha256:"  # before the hash of initial weights whose file is elsewhere
 # Values that recipes have had since protocol 2 began. One that is its default is left out of the
-# canonical JSON, so that cells which were run before keep their ids.
+# canonical JSON, so that cells and timings which were run before keep their ids.
 LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("data", "train_frames"),
     ("data", "test_scenes"),
@@ -236,15 +237,25 @@ def canonical_json(cell: Cell) -> str:
     values.pop("continues")
     if cell.continues is not None:
         values["continues"] = cell.continues.id
-    defaults = to_dict(Recipe())
     values["tasks"] = sorted(cell.tasks, reverse=True)
     values["recipe"]["data"]["dataset"] = cell.recipe.data.dataset.replace("_", "-")
-    for section, key in LATER:
-        if values["recipe"][section][key] == defaults[section][key]:
-            del values["recipe"][section][key]
+    leave_out_defaults(values["recipe"])
     if cell.pretrained not in (None, "timm"):
         values["pretrained"] = _content_hash(str(cell.pretrained))
     return json.dumps({"protocol": PROTOCOL, **values}, sort_keys=True, separators=(",", ":"))
+
+
+def leave_out_defaults(sections: dict[str, Any], kept: Collection[tuple[str, str]] = ()) -> None:
+    """Of a recipe's sections, or of some of them, drop LATER's values that are defaults.
+
+    Args:
+        kept: those that such jobs have always had.
+    """
+    defaults = to_dict(Recipe())
+    for section, key in LATER:
+        own = sections.get(section, {})
+        if key in own and (section, key) not in kept and own[key] == defaults[section][key]:
+            del own[key]
 
 
 def training_json(cell: Cell) -> str:
@@ -363,13 +374,8 @@ def check_cells(cells: Iterable[Cell]) -> None:
     """
     seen: set[tuple[str, str, tuple[str, ...]]] = set()
     for cell in cells:
-        declared = [plugins.attributes("tasks", task) for task in cell.tasks]
-        for task, facts in zip(cell.tasks, declared, strict=True):
-            stem, of_field = plugins.stem_and_field(task)[0], bool(facts.get("of_field"))
-            if of_field and task == stem:
-                raise ValueError(f"task '{task}' is of one field of the data set: {task}:FIELD")
-            if task != stem and not of_field:
-                raise ValueError(f"task '{stem}' is of no one field: '{stem}', not '{task}'")
+        check_tasks(cell.tasks)
+        declared = (plugins.attributes("tasks", task) for task in cell.tasks)
         if cell.video and not any(found.get("makes_labels") for found in declared):
             raise ValueError(f"video needs a task that makes labels, not {', '.join(cell.tasks)}")
         for kind, name, values in _chosen(cell):
@@ -383,6 +389,21 @@ def check_cells(cells: Iterable[Cell]) -> None:
                 if key not in known:
                     word = kind[:-1]
                     raise ValueError(f"{word} '{name}' has no '{key}'{did_you_mean(key, known)}")
+
+
+def check_tasks(tasks: Iterable[str]) -> None:
+    """Tasks exist, and name a field of the data set where they are of one.
+
+    Raises:
+        ValueError: an unknown task, one that lacks its field, or one that has a field too many.
+    """
+    for task in tasks:
+        stem = plugins.stem_and_field(task)[0]
+        of_field = plugins.attributes("tasks", task).get("of_field")
+        if of_field and task == stem:
+            raise ValueError(f"task '{task}' is of one field of the data set: {task}:FIELD")
+        if task != stem and not of_field:
+            raise ValueError(f"task '{stem}' is of no one field: '{stem}', not '{task}'")
 
 
 def _chosen(cell: Cell) -> list[tuple[str, str, Mapping[str, Any]]]:

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from mtl_bench.core.files import content
+from mtl_bench.core.scope import COMPREHENSIONS, SCOPES, bound, is_text, same_scope
 
 STAGES = ("train", "evaluate", "time")
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -34,18 +35,11 @@ HARNESS = "harness"
 EXCLUDED = {
     *("core.config", "core.recipe", "core.plain", "core.plugins", "core.provenance"),
     *("core.fingerprint", "core.columns", "core.quality", "core.files", "core.locks"),
-    *("core.toml_file", "core.canvas", "core.view"),
+    *("core.scope", "core.toml_file", "core.canvas", "core.view"),
     *("train.progress", "train.tracking", "train.curve"),
     *("bench.jobs", "bench.store", "bench.data_state", "cli", "report", "show"),
 }
 MEMBERS = "stage_members"
-SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
-COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
-INNER = (*SCOPES, *COMPREHENSIONS, ast.ClassDef, ast.Constant, ast.expr_context)
-NAMED = (
-    *(ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef),
-    *(ast.ExceptHandler, ast.MatchAs, ast.MatchStar),
-)
 NOT_RUN = ("TYPE_CHECKING", "typing.TYPE_CHECKING", "__name__ == '__main__'")
 DROPPED = {"ctx", "type_comment", "kind", "type_params", "returns", "simple", "type_ignores"}
 
@@ -208,7 +202,8 @@ def _definitions(target: Target) -> Iterator[tuple[Path, str]]:
 # --- files ----------------------------------------------------------------------------------------
 
 
-def _stamp(path: Path) -> tuple[int, int] | None:
+def stamp(path: Path) -> tuple[int, int] | None:
+    """When a file was written, and its size; None where there is none."""
     try:
         status = path.stat()
     except OSError:  # gone, or a link that leads nowhere
@@ -218,7 +213,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 def forget_edited() -> None:
     """Read all files anew if one of them was edited."""
-    if any(_stamp(path) != stamp for path, (stamp, _) in _modules.items()):
+    if any(stamp(path) != seen for path, (seen, _) in _modules.items()):
         _modules.clear()
         _known.clear()
 
@@ -226,7 +221,7 @@ def forget_edited() -> None:
 def load(path: Path) -> "Module":
     """A file as it was when this process first saw it, or saw that any had been edited."""
     if path not in _modules:
-        _modules[path] = _stamp(path), Module(path)
+        _modules[path] = stamp(path), Module(path)
     return _modules[path][1]
 
 
@@ -266,14 +261,14 @@ class Module:
             self._see(statement)
 
     def _see(self, statement: ast.stmt) -> None:
-        nodes = _same_scope([statement])
+        nodes = same_scope([statement])
         for node in nodes:
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 self.imports |= imported(node, self.path)
                 if isinstance(node, ast.ImportFrom) and node.names[0].name == "*":
                     base = _base(node, self.path)
                     self.stars += [base] if base is not None else []
-        if isinstance(statement, (ast.Import, ast.ImportFrom)) or _is_text(statement):
+        if isinstance(statement, (ast.Import, ast.ImportFrom)) or is_text(statement):
             return
         if isinstance(statement, ast.If) and ast.unparse(statement.test) in NOT_RUN:
             return
@@ -308,7 +303,7 @@ class Module:
         for statement in ancestry(self.path, name).values():
             for member in statement.body:
                 value = getattr(member, "value", None)
-                if MEMBERS in bound(_same_scope([member])) and value is not None:
+                if MEMBERS in bound(same_scope([member])) and value is not None:
                     found = found or {}
                     for stage, names in ast.literal_eval(value).items():
                         found.setdefault(stage, set()).update(names)
@@ -320,8 +315,8 @@ class Module:
         declared = self._stages_of(name)
         assert isinstance(statement, ast.ClassDef)
         assert declared is not None
-        members = [m for m in statement.body if MEMBERS not in bound(_same_scope([m]))]
-        named = {id(m): bound(_same_scope([m])) for m in members}
+        members = [m for m in statement.body if MEMBERS not in bound(same_scope([m]))]
+        named = {id(m): bound(same_scope([m])) for m in members}
         mentions = {
             id(m): {n.attr for n in ast.walk(m) if isinstance(n, ast.Attribute)}
             | {n.id for n in ast.walk(m) if isinstance(n, ast.Name)}
@@ -396,41 +391,6 @@ def _base(node: ast.ImportFrom, path: Path) -> Path | None:
     return of_package(".".join(words[1:])) if words[:1] == [NAME] else None
 
 
-def _same_scope(body: Iterable[ast.AST]) -> list[ast.AST]:
-    """The nodes of statements without what is inside functions, classes and comprehensions."""
-    nodes = list(body)
-    for node in nodes:  # which grows meanwhile
-        if not isinstance(node, INNER):
-            for name in node._fields:
-                value = getattr(node, name, None)
-                if isinstance(value, ast.AST):
-                    nodes.append(value)
-                elif isinstance(value, list):
-                    nodes += [item for item in value if isinstance(item, ast.AST)]
-    return nodes
-
-
-def bound(nodes: Iterable[ast.AST]) -> set[str]:
-    """The names that nodes bind, imports apart."""
-    names, elsewhere = set(), set()
-    for node in nodes:
-        if isinstance(node, ast.Name) and isinstance(node.ctx, (ast.Store, ast.Del)):
-            names.add(node.id)
-        elif isinstance(node, NAMED) and node.name is not None:
-            names.add(node.name)
-        elif isinstance(node, ast.MatchMapping) and node.rest:
-            names.add(node.rest)
-        elif isinstance(node, (ast.Global, ast.Nonlocal)):
-            elsewhere.update(node.names)
-    return names - elsewhere
-
-
-def _is_text(statement: ast.AST) -> bool:
-    """A docstring, `...` or `pass`: nothing that runs."""
-    constant = isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
-    return constant or isinstance(statement, ast.Pass)
-
-
 class _Normal:
     """Writes nodes in their normal form, and notes which definitions they use."""
 
@@ -454,7 +414,7 @@ class _Normal:
             self.text.append("]")
         elif not isinstance(node, ast.AST):
             self.text.append(f"{type(node).__name__} {node!r},")
-        elif isinstance(node, (ast.Import, ast.ImportFrom)) or _is_text(node):
+        elif isinstance(node, (ast.Import, ast.ImportFrom)) or is_text(node):
             pass
         elif isinstance(node, (ast.Name, ast.Attribute)):
             if not self._dotted(node):
@@ -462,7 +422,7 @@ class _Normal:
         elif isinstance(node, SCOPES):
             self._function(node)
         elif isinstance(node, COMPREHENSIONS):
-            targets = bound(_same_scope(generator.target for generator in node.generators))
+            targets = bound(same_scope(generator.target for generator in node.generators))
             self.scopes.append(dict.fromkeys(targets))
             self._fields(node)
             self.scopes.pop()
@@ -493,7 +453,7 @@ class _Normal:
         for annotation in [*(a.annotation for a in every), getattr(node, "returns", None)]:
             self._follow(annotation)
         body = node.body if isinstance(node.body, list) else [node.body]
-        nodes = _same_scope(body)
+        nodes = same_scope(body)
         local: dict[str, Target | None] = dict.fromkeys([*(a.arg for a in every), *bound(nodes)])
         for inner in nodes:
             if isinstance(inner, (ast.Import, ast.ImportFrom)):

@@ -35,6 +35,7 @@ from mtl_bench.core.fingerprint import (
     imported,
     of_package,
     ours,
+    stamp,
     submodule,
 )
 from mtl_bench.core.fingerprint import load as load_text
@@ -154,10 +155,7 @@ def _candidates(kind: str) -> dict[str, list[Path]]:
 def stamps(*kinds: str) -> tuple[object, ...]:
     """What changes when a file of these kinds comes, goes or is edited."""
     paths = [path for kind in kinds for several in _candidates(kind).values() for path in several]
-    return tuple(
-        (path, *((s := path.stat()).st_mtime_ns, s.st_size)) if path.is_file() else path
-        for path in paths
-    )
+    return tuple((path, stamp(path)) for path in paths)
 
 
 def stem_and_field(task: str) -> tuple[str, str]:

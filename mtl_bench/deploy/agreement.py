@@ -51,9 +51,9 @@ class Agreement:
             a, b, task = maps_a[name], maps_b[name], name.partition(".")[0]
             if b.shape != a.shape:
                 b = F.interpolate(b, a.shape[2:], mode="bilinear", align_corners=True)
-            self.maps_rms = max(
-                self.maps_rms, _largest(((b - a) / a.std().clamp(min=1e-9)).square().mean().sqrt())
-            )
+            spread = a.std() if a.numel() > 1 else a.abs()  # one number has no deviation
+            off_by = ((b - a) / spread.clamp(min=1e-9)).square().mean().sqrt()
+            self.maps_rms = max(self.maps_rms, _largest(off_by))
             if about.ids:
                 ids_a, ids_b = done_a[task][about.ids], done_b[task][about.ids]
                 self.measures[f"{about.words}_max"].append(_largest(b - a))

@@ -43,7 +43,7 @@ class FullSize(nn.Module):
     def forward(self, image_1HW3: Tensor) -> tuple[Tensor, ...]:
         size = self.size or image_1HW3.shape[1:3]
         found = [
-            F.interpolate(x, size, mode="bilinear", align_corners=True)
+            F.interpolate(x, size, mode="bilinear", align_corners=True) if x.dim() == 4 else x
             for x in self.strided(image_1HW3)
         ]
         infos = maps.infos(self.strided.tasks).values()

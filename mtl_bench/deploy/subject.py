@@ -15,6 +15,7 @@ from mtl_bench.core.backbone import divisor_of
 from mtl_bench.core.batch import Batch, Camera, collate
 from mtl_bench.core.config import Cell, Recipe, load_recipe
 from mtl_bench.core.device import initial_weights
+from mtl_bench.core.plugins import load
 from mtl_bench.core.task import Task, tasks_of_cell
 from mtl_bench.data.samples import open_samples
 from mtl_bench.deploy import maps
@@ -117,8 +118,14 @@ def on_device(camera: Camera, images: int, device: torch.device) -> Camera:
 
 def check_size(cell: Cell, size: tuple[int, int]) -> None:
     """Raises:
-    ValueError: a size that the network's deepest stride does not divide.
+    ValueError: a size that the network's deepest stride does not divide, or not the one that a
+        backbone of one vector is built for.
     """
+    data = cell.recipe.data
+    if load("backbones", cell.backbone).vector and size != (data.height, data.width):
+        raise ValueError(
+            f"--size {size[0]}x{size[1]}: this network is built for {data.height}x{data.width}"
+        )
     deepest = divisor_of(cell)
     if size[0] % deepest or size[1] % deepest:
         raise ValueError(f"--size {size[0]}x{size[1]}: the network needs multiples of {deepest}")

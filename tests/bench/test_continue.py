@@ -92,6 +92,13 @@ def test_train_continues_a_run(start, smoke_root, tmp_path, monkeypatch):
     with (tmp_path / "runs" / on.slug / "curve.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 1
     assert "done already" in train(*again, "--set", settings[1], "--set", settings[2])
+    other = shutil.copytree(
+        smoke_root, tmp_path / "other"
+    )  # what is continued may be of other data
+    (other / "synthetic.json").unlink()
+    with min(other.rglob("*.png")).open("ab") as opened:
+        opened.write(b"more")
+    assert "row.json" in train(*again, "--set", "seed=3", "--data", str(other))
     mailed = shutil.copy(directory / "last.pt", tmp_path / "mailed.pt")
     done = CliRunner().invoke(app, ["evaluate", str(mailed), "--data", str(smoke_root)])
     metric = store.load_row(directory)["metric"]
