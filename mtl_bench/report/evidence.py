@@ -1,11 +1,11 @@
-"""What paired runs say about lines of a table: intervals, tests, verdicts, aggregates, ranks.
+"""What paired runs say about lines of a table: intervals, tests, verdicts, aggregates.
 
 A score is a number per line, problem and seed, of which more is better: the log gain, in points.
 A block is a problem and a seed; lines are compared within blocks, since the seed fixes data order
 and initial weights for all of them.
 
-Shapes: L lines, M problems, N seeds, K tasks, F points of a front, B trials. NaN is a run that is
-missing, -inf a run that failed: it is the worst that can be, and is never dropped.
+Shapes: L lines, M problems, N seeds, B blocks, R runs, S sign patterns or resamples. NaN is a run
+that is missing, -inf a run that failed: it is the worst that can be, and is never dropped.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -42,7 +42,7 @@ class Comparison:
     p: float  # sign-flip test, two-sided
     p_holm: float  # over the declared family
     blocks: int
-    failed: int  # blocks of these in which one of the two failed
+    failed: int  # blocks of these in which one of the two failed, or both
 
     @property
     def verdict(self) -> str:
@@ -55,24 +55,19 @@ class Comparison:
 # --- means and intervals --------------------------------------------------------------------------
 
 
-def t_interval(x_N: Array, level: float = LEVEL) -> Estimate:
-    """Student's interval for the mean of one problem's runs.
-
-    A percentile bootstrap covers 75 % in place of 95 % with three seeds, and 83 % with five.
-    """
-    return stratified_t(np.asarray(x_N, float)[None], level)
-
-
 def stratified_t(x_MN: Array, level: float = LEVEL) -> Estimate:
     """Interval for the mean over problems of the mean over seeds; the problems are given.
 
-    Degrees of freedom as of Welch and Satterthwaite: problems may differ in spread and in n.
+    Degrees of freedom as of Welch and Satterthwaite: problems may differ in spread and in n. Of one
+    problem it is Student's interval, and not a percentile bootstrap, which covers 75 % in place of
+    95 % with three seeds, and 83 % with five.
     """
-    strata = [row[~np.isnan(row)] for row in np.asarray(x_MN, float)]
+    strata = [row[~np.isnan(row)] for row in x_MN]
     strata = [row for row in strata if len(row)]
     if not strata:
         return Estimate(np.nan, np.nan, np.nan)
-    mean = float(np.mean([row.mean() for row in strata]))
+    with np.errstate(invalid="ignore"):  # runs of both sides failed
+        mean = float(np.mean([row.mean() for row in strata]))
     if not np.isfinite(mean) or any(len(row) < 2 for row in strata):
         return Estimate(mean, np.nan, np.nan)
     parts = np.array([row.var(ddof=1) / len(row) for row in strata]) / len(strata) ** 2
@@ -142,17 +137,19 @@ def compare(
     for line_MN in score_LMN:
         d_MN = difference(line_MN, control_MN)
         d_B = d_MN[~np.isnan(d_MN)]
-        narrow = stratified_t(d_MN, 0.9)
+        # a tie of two failed runs is no sign that the lines are alike
+        apart_MN = np.where(np.isneginf(line_MN) & ~np.isnan(d_MN), -np.inf, d_MN)
+        narrow = stratified_t(apart_MN, 0.9)
         found.append(
             Comparison(
-                difference=stratified_t(d_MN),
+                difference=stratified_t(apart_MN),
                 ahead=bool(clipped(d_B).sum() > 0),
                 within=-margin < narrow.low and narrow.high < margin,
                 superior=superiority(d_B),
                 p=sign_flip(d_B, seed),
                 p_holm=np.nan,
                 blocks=len(d_B),
-                failed=int(np.isinf(d_B).sum()),
+                failed=int(np.isinf(apart_MN).sum()),
             )
         )
     corrected = holm([each.p for each in found])
@@ -203,55 +200,3 @@ def holm(p_L: Sequence[float]) -> list[float]:
 def superiority(d_B: Array) -> float:
     """Share of blocks in which a line is ahead, ties half: P(X > Y), paired."""
     return float(np.mean((np.sign(d_B) + 1) / 2)) if len(d_B) else np.nan
-
-
-# --- the suite as a whole -------------------------------------------------------------------------
-
-
-def profile(score_MN: Array, tau_T: Array) -> Array:
-    """Share of runs whose score is above each threshold. Source: Agarwal et al., NeurIPS 2021."""
-    known = score_MN[~np.isnan(score_MN)]
-    return np.array([(known > tau).mean() if len(known) else np.nan for tau in tau_T])
-
-
-def expected_best(validation_B: Array, score_B: Array | None = None) -> Array:
-    """Expected score of the trial that is chosen by validation, for a budget of 1 ... B trials.
-
-    Source: Dodge et al., EMNLP 2019: one set of finished trials gives every smaller budget.
-
-    Args:
-        validation_B: what a trial is chosen by; -inf for one that failed.
-        score_B: what the chosen one is judged by; None: the same.
-    """
-    validation_B = np.asarray(validation_B, float)
-    score_B = validation_B if score_B is None else np.asarray(score_B, float)
-    order = np.argsort(validation_B, kind="stable")
-    trials = len(order)
-    share = np.arange(trials + 1) / trials
-    found = []
-    for budget in range(1, trials + 1):
-        weight_B = share[1:] ** budget - share[:-1] ** budget
-        found.append(float(np.sum(weight_B * score_B[order])))
-    return np.array(found)
-
-
-def behind_front(point_K: Array, front_FK: Array) -> float:
-    """How far a point must improve in every task not to be dominated by a front; 0 or less: it is
-    on the front or beyond it (the additive epsilon indicator)."""
-    return float(np.max(np.min(front_FK - point_K, axis=1)))
-
-
-def ranks(score_L: Array) -> Array:
-    """1 is the best; equal ones share the mean of their ranks, and a NaN has none."""
-    return np.asarray(stats.rankdata(-np.asarray(score_L), nan_policy="omit"), float)
-
-
-def rank_bands(variants_VL: Array) -> list[tuple[float, float]]:
-    """Best and worst rank of each line over variants of the same comparison.
-
-    Args:
-        variants_VL: scores of the lines under each definition of the gain, resample of the seeds
-            and left-out problem.
-    """
-    rank_VL = np.array([ranks(scores) for scores in variants_VL])
-    return [(float(np.nanmin(column)), float(np.nanmax(column))) for column in rank_VL.T]

@@ -47,7 +47,7 @@ from mtl_bench.report.table import (
     single,
     write,
 )
-from mtl_bench.report.verdicts import Verdicts, forest, judge, notes, section
+from mtl_bench.report.verdicts import Verdicts, forest, judge, notes, section, untested
 from mtl_bench.train.curve import read as read_curve
 
 PUBLISHED = Path(__file__).parent / "literature.toml"
@@ -355,7 +355,7 @@ def footnotes(results: Results) -> Iterator[str]:
         yield _delta(results)
     if results.reference is not None:
         yield from _relative(results, results.reference)
-    if results.baseline:
+    if results.baseline and results.tasks():
         yield _trivial(results.tasks())
     stale = [row for group in groups if group.status == "stale" for row in group.rows]
     if stale:
@@ -372,7 +372,8 @@ def _delta(results: Results) -> str:
     against = " or ".join(dict.fromkeys(str(row["delta_baseline"]) for row in own))
     metrics = counted(rows)
     tasks = list(dict.fromkeys(column.task for column in metrics))
-    named = ", and ".join(_named([c for c in metrics if c.task == task]) for task in tasks)
+    joint = ", and " if len(metrics) > len(tasks) else ", "
+    named = joint.join(_named([c for c in metrics if c.task == task]) for task in tasks)
     return (
         f"Delta: over {named}, relative to the baseline ({against}) of the same seed. "
         f"Flat: mean relative loss over the {_count(metrics)} metrics, so that "
@@ -463,6 +464,9 @@ def _write(
             sections=(*table.sections, section(judged)),
             notes=(*table.notes, *notes(judged)),
         )
+    elif (control := Layout.of(grid.report).control) is not None:
+        lines = [", ".join(group.identity) for group in results.groups]
+        table = replace(table, notes=(*table.notes, untested(control, lines)))
     page = Page(
         kind="grid",
         title=f"{grid.name}: mtl-bench report",

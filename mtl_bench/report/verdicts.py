@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from mtl_bench.core.plain import did_you_mean
 from mtl_bench.core.style import BASELINE, GRAY, PALETTE, save, styled
 from mtl_bench.report import evidence
 from mtl_bench.report.columns import Row, column, measured, text
@@ -47,7 +48,7 @@ class Verdicts:
 
 
 def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
-    """Hold every line of a grid against one; None where fewer than two seeds have both.
+    """Hold every line of a grid against one; None where no other shares two blocks with it.
 
     Args:
         rows: with `delta.gain` among their metrics where they are done; failed ones, too.
@@ -101,7 +102,7 @@ def section(found: Verdicts) -> Section:
         Head("step", f"x of {found.control}"),
     )
     lines = [_table_row(line) for line in found.lines]
-    own = TableRow.of(found.control, *[""] * 6, _points(found.control_iqm), "1.00")
+    own = TableRow.of(found.control, *[""] * 6, _points(found.control_iqm), "")
     return Section(
         heading=f"Against {found.control}",
         heads=heads,
@@ -118,16 +119,33 @@ def sentence(found: Verdicts) -> str:
     cost = [line.step_x for line in of["better"] if not math.isnan(line.step_x)]
     at = f" (at {np.median(cost):.2f} times its step time)" if cost else ""
     return (
-        f"{len(of['better'])} of {total} lines beat {found.control}{at}, "
-        f"{len(of['equivalent'])} are equivalent within {evidence.MARGIN:g} point, "
-        f"{len(of['worse'])} are worse, and {len(of['open'])} are open."
+        f"{total} line{'s' * (total > 1)} against {found.control}: {len(of['better'])} better{at}, "
+        f"{len(of['equivalent'])} equivalent within {evidence.MARGIN:g} point, "
+        f"{len(of['worse'])} worse, {len(of['open'])} open."
+    )
+
+
+def untested(control: str, lines: Sequence[str]) -> str:
+    """Why no line is tested against the control, in one sentence.
+
+    Args:
+        lines: their names.
+    """
+    if control not in lines:
+        return f"Nothing is tested against '{control}': no such line{did_you_mean(control, lines)}."
+    return (
+        f"Nothing is tested against '{control}': it takes two seeds or problems in which this line "
+        "and another have a log gain; the baseline of the gain has none."
     )
 
 
 def notes(found: Verdicts) -> list[str]:
     """What a reader must know before believing the verdicts."""
     blocks = max(line.comparison.blocks for line in found.lines)
-    made = f"{found.problems} problem{'s' * (found.problems > 1)} x {found.seeds} seeds"
+    made = " x ".join(
+        f"{count} {what}{'s' * (count > 1)}"
+        for what, count in (("problem", found.problems), ("seed", found.seeds))
+    )
     said = [
         "Gain: 100 times the mean log ratio to the baseline of the same seed, first over a task's "
         "metrics and then over tasks; one point is about one percent.",
@@ -139,7 +157,11 @@ def notes(found: Verdicts) -> list[str]:
     ]
     failed = sum(line.comparison.failed for line in found.lines)
     if failed:
-        said.append(f"Failed runs count as the worst: {failed} blocks have one.")
+        said.append(
+            "Failed runs, and those with a 0 where more is better, count as the worst: "
+            f"{failed} block{'s' * (failed > 1)} of line and control with one. Such a line has no "
+            "mean difference and is never equivalent."
+        )
     if len(found.lines) * 2 / 2**blocks > 1 - evidence.LEVEL:
         said.append(
             f"With {blocks} blocks no line of {len(found.lines)} can be better or worse by this "
@@ -148,9 +170,15 @@ def notes(found: Verdicts) -> list[str]:
     return said
 
 
-def forest(found: Verdicts, out_dir: Path, name: str) -> str:
-    """The differences with their intervals, coloured by verdict, and the margin of equivalence."""
+def forest(found: Verdicts, out_dir: Path, name: str) -> str | None:
+    """The differences with their intervals, coloured by verdict, and the margin of equivalence.
+
+    Returns:
+        What the figure shows in words, or None where every line has failed runs.
+    """
     shown = [line for line in found.lines if np.isfinite(line.comparison.difference.mean)]
+    if not shown:
+        return None
     with styled():
         figure = Figure(figsize=(7.2, 1.3 + 0.24 * len(shown)), layout="constrained")
         axes = figure.add_subplot()
@@ -172,9 +200,11 @@ def forest(found: Verdicts, out_dir: Path, name: str) -> str:
         if found.smoke:
             axes.set_title(SMOKE, color="#a40000")
         save(figure, out_dir, name)
+    left_out = [line.label for line in found.lines if line not in shown]
+    lacking = f" Not drawn, as runs failed: {', '.join(left_out)}." if left_out else ""
     return (
         f"Paired differences to {found.control} with 95 % intervals; gray: the margin of "
-        f"equivalence, {PLUS_MINUS}{evidence.MARGIN:g} point. {sentence(found)}"
+        f"equivalence, {PLUS_MINUS}{evidence.MARGIN:g} point. {sentence(found)}{lacking}"
     )
 
 
@@ -213,7 +243,7 @@ def _ratio(step_MN: Array, control_MN: Array) -> float:
 def _table_row(line: Line) -> TableRow:
     each = line.comparison
     of, p = each.difference, each.p_holm
-    between = "-" if np.isnan(of.low) else f"{of.low:+.1f} ... {of.high:+.1f}"
+    between = "-" if np.isnan(of.low) else f"{_signed(of.low)} ... {_signed(of.high)}"
     return TableRow.of(
         line.label,
         str(each.blocks),
@@ -228,7 +258,10 @@ def _table_row(line: Line) -> TableRow:
 
 
 def _signed(value: float) -> str:
-    return f"{value:+.1f}" if np.isfinite(value) else "failed"
+    """A difference; infinite ones are of failed runs."""
+    if np.isfinite(value):
+        return f"{value:+z.1f}"
+    return "control failed" if value > 0 else "failed"
 
 
 def _points(of: Estimate) -> Cell:
@@ -236,5 +269,7 @@ def _points(of: Estimate) -> Cell:
         return Cell("failed" if np.isinf(of.mean) else "-")
     known = np.isfinite(of.low) and np.isfinite(of.high)
     return Cell(
-        f"{of.mean:+.1f}", f"({of.low:+.1f} ... {of.high:+.1f})" if known else "", value=of.mean
+        _signed(of.mean),
+        f"({_signed(of.low)} ... {_signed(of.high)})" if known else "",
+        value=of.mean,
     )

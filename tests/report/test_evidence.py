@@ -10,19 +10,13 @@ from scipy import stats
 from mtl_bench.evaluate.delta import log_gain
 from mtl_bench.report import evidence
 from mtl_bench.report.evidence import (
-    behind_front,
     bootstrap,
     compare,
-    expected_best,
     holm,
     iqm,
-    profile,
-    rank_bands,
-    ranks,
     sign_flip,
     stratified_t,
     superiority,
-    t_interval,
 )
 
 RNG = np.random.default_rng(20)
@@ -49,10 +43,10 @@ def test_log_gain_treats_a_doubled_and_a_halved_error_alike():
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 10])
-def test_t_interval_is_scipys(count):
+def test_the_interval_of_one_problem_is_scipys(count):
     x = RNG.normal(3, 2, count)
     theirs = stats.ttest_1samp(x, 0).confidence_interval(0.95)
-    ours = t_interval(np.append(x, NAN))  # a missing run is none
+    ours = stratified_t(np.append(x, NAN)[None])  # a missing run is none
     assert (ours.mean, ours.low, ours.high) == pytest.approx((x.mean(), *theirs))
 
 
@@ -67,13 +61,13 @@ def test_two_problems_of_unlike_spread_are_welchs_interval():
 
 
 def test_what_cannot_be_known_is_nan():
-    one = t_interval(np.array([2.0]))
+    one = stratified_t(np.array([[2.0]]))
     assert one.mean == 2
     assert math.isnan(one.low)
-    assert math.isnan(t_interval(np.array([NAN])).mean)
-    failed = t_interval(np.array([1.0, FAILED]))
+    assert math.isnan(stratified_t(np.array([[NAN]])).mean)
+    failed = stratified_t(np.array([[1.0, FAILED]]))
     assert (failed.mean, math.isnan(failed.high)) == (FAILED, True)
-    same = t_interval(np.array([2.0, 2.0]))
+    same = stratified_t(np.array([[2.0, 2.0]]))
     assert (same.low, same.high) == (2, 2)
 
 
@@ -165,6 +159,17 @@ def test_verdicts():
     assert found[0].p_holm >= found[0].p
 
 
+def test_lines_that_fail_together_are_not_equivalent():
+    control = RNG.normal(0, 1, (1, 4))
+    control[0, 2] = FAILED
+    same, ahead = compare(np.stack([control, np.full((1, 4), 9.0)]), control)
+    assert (same.difference.mean, same.blocks, same.failed) == (FAILED, 4, 1)
+    assert (same.p, same.verdict) == (1, "open")
+    assert (ahead.difference.mean, ahead.failed, ahead.superior) == (-FAILED, 1, 1)
+    (both,) = compare(np.array([[[FAILED, 1.0, 2]]]), np.array([[0, FAILED, 1.0]]))
+    assert (math.isnan(both.difference.mean), both.failed) == (True, 2)
+
+
 def test_a_missing_run_leaves_out_its_block_and_a_failed_one_does_not():
     control = RNG.normal(0, 1, (2, 6))
     line = control + 1
@@ -174,41 +179,6 @@ def test_a_missing_run_leaves_out_its_block_and_a_failed_one_does_not():
     assert found.difference.mean == FAILED
     assert found.superior == pytest.approx(10 / 11)
     assert not found.within
-
-
-# --- the suite ------------------------------------------------------------------------------------
-
-
-def test_profile_counts():
-    x = np.array([[1.0, 2, NAN], [3, FAILED, 2]])
-    assert profile(x, np.array([0, 1, 2, 3])).tolist() == [0.8, 0.6, 0.2, 0]
-
-
-def test_expected_best_is_the_mean_over_all_draws():
-    validation, test = np.array([3.0, 1, 2, 5]), np.array([10.0, 40, 20, 30])
-    for budget in (1, 2, 3, 4):
-        draws = list(itertools.product(range(4), repeat=budget))
-        chosen = [max(draw, key=lambda i: validation[i]) for draw in draws]
-        at = budget - 1
-        assert expected_best(validation)[at] == pytest.approx(validation[chosen].mean())
-        assert expected_best(validation, test)[at] == pytest.approx(test[chosen].mean())
-
-
-def test_distance_to_a_front():
-    front = np.array([[0.0, 4], [2, 2], [4, 0]])
-    assert behind_front(np.array([1.0, 1]), front) == 1  # one more in both reaches (2, 2)
-    assert behind_front(np.array([2.0, 2]), front) == 0
-    assert behind_front(np.array([5.0, 5]), front) < 0
-    point, steps = np.array([0.5, 0.25]), np.arange(0, 5, 0.01)
-    dominated = [(front >= point + s).all(1) & (front > point + s).any(1) for s in steps]
-    least = next(s for s, d in zip(steps, dominated, strict=True) if not d.any())
-    assert behind_front(point, front) == pytest.approx(least, abs=0.011)
-
-
-def test_ranks_and_their_bands():
-    assert ranks(np.array([3.0, 1, 3, FAILED])).tolist() == [1.5, 3, 1.5, 4]
-    variants = np.array([[3.0, 2, 1], [2, 3, 1], [3, 2, NAN]])
-    assert rank_bands(variants) == [(1, 2), (1, 2), (3, 3)]
 
 
 # --- coverage -------------------------------------------------------------------------------------

@@ -47,8 +47,8 @@ def test_lines_are_told_apart_although_seeds_spread_wider():
     assert found.lines[0].comparison.difference.mean == pytest.approx(3, abs=0.4)
     assert found.lines[0].step_x == 2.5
     assert sentence(found) == (
-        "1 of 3 lines beat fixed (at 2.50 times its step time), 1 are equivalent within 1 point, "
-        "1 are worse, and 0 are open."
+        "3 lines against fixed: 1 better (at 2.50 times its step time), 1 equivalent within 1 "
+        "point, 1 worse, 0 open."
     )
 
 
@@ -75,7 +75,7 @@ def test_a_failed_run_is_the_worst_and_a_missing_one_is_none():
     ahead = verdict_of(rows, "ahead")
     assert (ahead.blocks, ahead.failed, ahead.verdict) == (6, 1, "open")
     assert any(
-        "Failed runs count as the worst: 1 blocks" in n
+        "count as the worst: 1 block of line and control with one." in n
         for n in notes(judge(rows, "method", "fixed"))
     )
 
@@ -89,22 +89,47 @@ def test_few_seeds_are_said_to_be_too_few():
     assert judge([failed_row()], "method", "fixed") is None
 
 
-def test_the_page_the_tables_and_the_picture_have_it(tmp_path):
-    grid = SimpleNamespace(
+def grid_of(control):
+    return SimpleNamespace(
         name="methods",
         question="Which?",
         recipe=SimpleNamespace(name="small"),
-        report={"rows": "method", "control": "fixed"},
+        report={"rows": "method", "control": control},
         cells=(),
         skips=(),
     )
-    page = report.build(grid, suite(range(8)), tmp_path).read_text()
+
+
+def test_where_nothing_is_tested_the_page_says_why(tmp_path):
+    page = report.build(grid_of("fixed"), suite(range(1)), tmp_path).read_text()
+    assert "Nothing is tested against &#39;fixed&#39;: it takes two seeds or problems" in page
+    page = report.build(grid_of("fixde"), suite(), tmp_path).read_text()
+    assert "no such line (did you mean &#39;fixed&#39;?)" in page
+    assert not (tmp_path / "forest.png").exists()
+
+
+def test_a_failed_run_is_told_in_table_and_picture(tmp_path):
+    rows = suite()
+    for row in rows:
+        if (row["method"], row["seed"]) in {("ahead", 1), ("fixed", 2), ("same", 2)}:
+            row |= {"status": "failed", "metric": {}, "error": "NaN"}
+    found = judge(rows, "method", "fixed")
+    shown = {line.cells[0].text: line.cells[2].text for line in section(found).lines}
+    assert shown == {"ahead": "failed", "same": "failed", "behind": "control failed", "fixed": ""}
+    assert forest(found, tmp_path, "forest") is None
+    rest = [row for row in rows if row["seed"] != 2]
+    caption = forest(judge(rest, "method", "fixed"), tmp_path, "forest")
+    assert caption.endswith("Not drawn, as runs failed: ahead.")
+
+
+def test_the_page_the_tables_and_the_picture_have_it(tmp_path):
+    page = report.build(grid_of("fixed"), suite(range(8)), tmp_path).read_text()
     assert "Against fixed" in page
-    assert "1 of 3 lines beat fixed" in page
+    assert page.count("<p>3 lines against fixed: 1 better") == 1
     assert (tmp_path / "forest.png").stat().st_size > 5000
     tables = {name: (tmp_path / name).read_text() for name in ("table.md", "table.tex")}
     assert "| better |" in tables["table.md"]
-    assert r"\caption{Against fixed. 1 of 3 lines" in tables["table.tex"]
+    assert r"\caption{Against fixed. 3 lines against fixed: 1 better" in tables["table.tex"]
     head = (tmp_path / "table.csv").read_text().splitlines()[0].split(",")
     assert {"gain", "gain_std"} <= set(head)
 
