@@ -161,12 +161,12 @@ def export(
     The inputs' and outputs' names are printed; NAME.json beside it says what each of them is.
     """
     cell, model = _network(checkpoint, backbone, recipe, tasks, settings)
+    from mtl_bench.core.backbone import check_size, divisor_of
     from mtl_bench.deploy import export as exporter
-    from mtl_bench.deploy.subject import check_size
 
-    check_size(cell, o.size(size))
+    check_size(cell, o.size(size), "--size")
     origin = {} if checkpoint is None else {"cell_id": cell.id, "cell": cell.slug}
-    multiple = cell.recipe.network.strides[-1] if dynamic else None
+    multiple = divisor_of(cell) if dynamic else None
     paths = exporter.export(model.net.eval(), o.size(size), out, post, origin, multiple)
     for path in paths:
         typer.echo(f"{path}  {path.stat().st_size / 1e6:.1f} MB")

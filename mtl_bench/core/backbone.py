@@ -112,6 +112,28 @@ class TimmBackbone(Backbone):
         return [p for p, gradient in zip(own, found, strict=True) if gradient is not None]
 
 
+def check_size(cell: Cell, size: tuple[int, int], what: str, remedy: str = "") -> None:
+    """Refuse images that a cell's network cannot take.
+
+    Args:
+        size: height and width.
+        what: whose size it is, and `remedy` what else may be changed, in the message.
+
+    Raises:
+        ValueError: not a multiple of the deepest stride; of a vector, not the size it is made for.
+    """
+    data, divisor = cell.recipe.data, divisor_of(cell)
+    named = f"{what} {size[0]}x{size[1]}"
+    if plugins.load("backbones", cell.backbone).vector:
+        if size != (data.height, data.width):
+            raise ValueError(
+                f"{named}: backbone '{cell.backbone}' gives one vector, and is made for "
+                f"{data.height}x{data.width} alone"
+            )
+    elif size[0] % divisor or size[1] % divisor:
+        raise ValueError(f"{named} is not divisible by the deepest stride {divisor}{remedy}")
+
+
 def divisor_of(cell: Cell) -> int:
     """What the height and width of a cell's images are multiples of."""
     backbone = plugins.load("backbones", cell.backbone)

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench import __version__
@@ -28,6 +27,7 @@ from mtl_bench.core.labels import LabelSet
 from mtl_bench.core.task import Task
 from mtl_bench.deploy import maps
 from mtl_bench.deploy.graph import Strided, free, strided
+from mtl_bench.model.network import resize
 
 POST = ("inside", "apart", "none")
 OPSET = 20
@@ -42,10 +42,7 @@ class FullSize(nn.Module):
 
     def forward(self, image_1HW3: Tensor) -> tuple[Tensor, ...]:
         size = self.size or image_1HW3.shape[1:3]
-        found = [
-            F.interpolate(x, size, mode="bilinear", align_corners=True) if x.dim() == 4 else x
-            for x in self.strided(image_1HW3)
-        ]
+        found = [resize(x, size) for x in self.strided(image_1HW3)]
         infos = maps.infos(self.strided.tasks).values()
         return tuple(
             map_.argmax(1).int() if about.classes else map_
@@ -109,7 +106,7 @@ def export(
     graph = strided(net, (1, *size), multiple=multiple)
     full = FullSize(graph, size if multiple is None else None)
     tasks = graph.tasks
-    names = [about.exported for about in maps.infos(tasks).values()]
+    names = maps.maps_of(tasks)
     camera = maps.camera_of(tasks, size)
     finish, results = Post(tasks), maps.results_of(tasks)
     image = {"image": torch.randint(0, 256, (1, *size, 3), dtype=torch.uint8)}

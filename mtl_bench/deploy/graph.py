@@ -12,12 +12,12 @@ from abc import abstractmethod
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, fx, nn
 
 from mtl_bench.core.engine import Engine, Setting
 from mtl_bench.deploy import maps
 from mtl_bench.deploy.maps import Maps
+from mtl_bench.model.network import resize
 
 
 class Body(nn.Module):
@@ -102,25 +102,30 @@ class GraphEngine(Engine):
     def __init__(self, net: nn.Module, setting: Setting):
         super().__init__(net, setting)
         self._infos = maps.infos(maps.tasks_of(net))
-        self._upsample: Upsample | None = None
+        self._upsamples: dict[torch.Size, Upsample] = {}  # by the size of the strided maps
 
     @abstractmethod
     def strided(self, image: Any) -> Maps:
         """Maps at the finest stride by the names of the graph."""
 
     def run(self, image: Any) -> Maps:
-        small = self.strided(image)
-        first = next(iter(small.values()))
-        if self._upsample is None:
-            size = (first.shape[2], first.shape[3])
-            self._upsample = Upsample(size, self.setting.size, first.device)
         large: Maps = {}
-        for name, map_ in small.items():
+        for name, map_ in self.strided(image).items():
             classes = self._infos[name].classes
-            large[name] = map_ if classes else self._upsample.values(map_)
+            large[name] = map_ if classes else resize(map_, self.setting.size)
             if classes:
-                large[f"{name}{maps.CLASS}"] = self._upsample.classes(map_)
+                large[f"{name}{maps.CLASS}"] = self._classes(map_)
         return large
+
+    def _classes(self, logits: Tensor) -> Tensor:
+        """Index of the largest, of a vector [B,C] or at the image's size of maps [B,C,h,w]."""
+        if logits.dim() == 2:
+            return logits.argmax(1)
+        small = logits.shape[2:]
+        if small not in self._upsamples:
+            size = (small[0], small[1])
+            self._upsamples[small] = Upsample(size, self.setting.size, logits.device)
+        return self._upsamples[small].classes(logits)
 
 
 # --- folding --------------------------------------------------------------------------------------
@@ -241,14 +246,10 @@ class Upsample:
         self._row_H, self._down_Ph, self._fy_Ph = _axis(small[0], large[0], device)
         self._column_W, self._right_Pw, self._fx_Pw = _axis(small[1], large[1], device)
 
-    def values(self, maps_BChw: Tensor) -> Tensor:
-        """Every pixel of every map, float32."""
-        return F.interpolate(maps_BChw.float(), self.size, mode="bilinear", align_corners=True)
-
     def classes(self, logits_BChw: Tensor) -> Tensor:
         """Index [B,H,W] (uint8) of the largest of the interpolated logits; of equals the first."""
         if logits_BChw.device.type == "cuda":  # has the bandwidth, and would wait for the host
-            return self.values(logits_BChw).argmax(1).to(torch.uint8)
+            return resize(logits_BChw, self.size).argmax(1).to(torch.uint8)
         return torch.stack([self._classes(logits_Chw) for logits_Chw in logits_BChw.float()])
 
     def _classes(self, logits_Chw: Tensor) -> Tensor:

@@ -101,13 +101,24 @@ def delivered(tasks: Sequence[Task], maps: Maps, camera: Sequence[Tensor]) -> li
 
 def meanings(tasks: Iterable[Task]) -> dict[str, str]:
     """Of the inputs and outputs of exported files by name, as far as tasks say it."""
-    return IMAGE | CAMERA | {name: about for task in tasks for name, about in task.meaning.items()}
+    own = {_of(task, name): about for task in tasks for name, about in task.meaning.items()}
+    return IMAGE | CAMERA | own
+
+
+def maps_of(tasks: Iterable[Task]) -> list[str]:
+    """Names of exported maps."""
+    return [_of(task, about.exported) for task in tasks for about in task.maps.values()]
 
 
 def results_of(tasks: Iterable[Task]) -> list[str]:
     """Names of what `delivered` gives."""
     return [
-        name
+        _of(task, name)
         for task in tasks
         for name in (*task.exported, *(["points"] if task.has_points else []))
     ]
+
+
+def _of(task: Task, name: str) -> str:
+    """A name that no other task's file has: one task may stand there for several fields."""
+    return f"{name}:{task.field}" if task.field else name

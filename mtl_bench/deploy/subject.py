@@ -11,11 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, geometry
-from mtl_bench.core.backbone import divisor_of
+from mtl_bench.core.backbone import check_size
 from mtl_bench.core.batch import Batch, Camera, collate
 from mtl_bench.core.config import Cell, Recipe, load_recipe
 from mtl_bench.core.device import initial_weights
-from mtl_bench.core.plugins import load
 from mtl_bench.core.task import Task, tasks_of_cell
 from mtl_bench.data.samples import open_samples
 from mtl_bench.deploy import maps
@@ -79,9 +78,9 @@ def subject(
     """A network and the evaluation split's first frames at a size.
 
     Raises:
-        ValueError: a size that the network's deepest stride does not divide.
+        ValueError: a size that the network cannot take.
     """
-    check_size(cell, size)
+    check_size(cell, size, "--size")
     split = cell.recipe.evaluate.images
     looks = open_samples(cell.recipe, (), split, data, training=False)  # at images, not at labels
     samples = [looks.sample(n, None) for n in range(min(images, len(looks)))]
@@ -114,21 +113,6 @@ def subject(
 def on_device(camera: Camera, images: int, device: torch.device) -> Camera:
     """One camera's values for so many images."""
     return camera.map(lambda value: value.expand(images, *value.shape[1:]).to(device))
-
-
-def check_size(cell: Cell, size: tuple[int, int]) -> None:
-    """Raises:
-    ValueError: a size that the network's deepest stride does not divide, or not the one that a
-        backbone of one vector is built for.
-    """
-    data = cell.recipe.data
-    if load("backbones", cell.backbone).vector and size != (data.height, data.width):
-        raise ValueError(
-            f"--size {size[0]}x{size[1]}: this network is built for {data.height}x{data.width}"
-        )
-    deepest = divisor_of(cell)
-    if size[0] % deepest or size[1] % deepest:
-        raise ValueError(f"--size {size[0]}x{size[1]}: the network needs multiples of {deepest}")
 
 
 def prepare(

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mtl_bench.core import config, plugins
-from mtl_bench.core.backbone import VECTOR, Backbone, divisor_of
+from mtl_bench.core.backbone import VECTOR, Backbone, check_size
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import FROZEN
 from mtl_bench.core.plain import did_you_mean
@@ -133,7 +133,7 @@ class Network(nn.Module):
         for task in self.tasks:
             maps = task.activate(raw[task.name])
             outputs.maps[task.name] = {
-                name: _resize(map_, image_B3HW.shape[2:]) for name, map_ in maps.items()
+                name: resize(map_, image_B3HW.shape[2:]) for name, map_ in maps.items()
             }
         return outputs
 
@@ -247,14 +247,10 @@ def build_model(cell: config.Cell, tasks: Sequence[Task]) -> Model:
                 f"network.strides to some of {', '.join(map(str, kind.offered))}"
             )
         given["strides"] = sizes.strides
-    divisor = divisor_of(cell)
     timed_size = timed.height or data.height, timed.width or data.width
-    for section, (height, width) in (("data", (data.height, data.width)), ("latency", timed_size)):
-        if height % divisor or width % divisor:
-            raise ValueError(
-                f"input {height}x{width} is not divisible by the deepest stride {divisor}: "
-                f"change {section}.height, {section}.width or network.strides"
-            )
+    for section, size in (("data", (data.height, data.width)), ("latency", timed_size)):
+        remedy = f": change {section}.height, {section}.width or network.strides"
+        check_size(cell, size, "input", remedy)
     network = Network(kind(**given), sizes, tasks)
     if frozen is not None:
         network.freeze(str(frozen))
@@ -274,7 +270,7 @@ def side_by_side(models: Iterable[Model]) -> Model:
     return Model(net, [task for model in models for task in model.tasks])
 
 
-def _resize(x_BCHW: Tensor, size: torch.Size) -> Tensor:
+def resize(x_BCHW: Tensor, size: Sequence[int]) -> Tensor:
     """To the input's size, in float32, with the paper's alignment of corners; a vector stays."""
     if x_BCHW.dim() == 2:
         return x_BCHW.float()
