@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.style import GRAY, MARKERS, looks, save, styled
-from mtl_bench.report.plots import better, draw_front
+from mtl_bench.report.plots import FRONT, better, draw_front
 from mtl_bench.report.statistics import SMOKE
 
 if TYPE_CHECKING:
@@ -56,10 +56,10 @@ def against_quality(timings: "Timings", column: Column, out_dir: Path) -> str | 
             _plain_log(axes, f"{FPS.title} ({better(FPS)} is better)")
             axes.margins(0.12)
         for (axes, _), points in zip(panels, fronts, strict=True):  # they share the y axis
-            draw_front(axes, points, column.better)
+            draw_front(axes, points, (FPS.better, column.better))
         title = ", ".join(filter(None, (column.title, column.unit)))
         panels[0][0].set_ylabel(f"{title} ({better(column)} is better)")
-        _legend(figure, timings, lines, [Line2D([], [], color=GRAY, label="Pareto front")])
+        _legend(figure, timings, lines, [Line2D([], [], label="Pareto front", **FRONT)])
         save(figure, out_dir, f"{column.name}_{FPS.name}")
     return f"{column.title} over {FPS.in_words}, all tasks. {_where_from(timings)}"
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 RINGS = (10, 14, 20, 27, 35, 45, 57, 70)  # distances of a number from its point, in points
 ANGLES = [math.radians(a) for a in range(45, 405, 30)]
 ROOM = 9.5  # around a number, in points
+FRONT: dict[str, Any] = {"color": GRAY, "linewidth": 1.2, "zorder": 1}
 Point = tuple[float, float]
 
 
@@ -44,7 +45,11 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         return None
     many = len(groups) > MANY
     with styled():
-        figure = Figure(figsize=(9.2, 4.8) if many else (6.4, 3.6), layout="constrained")
+        longest = max(len(group.label) for group in groups)
+        across = max(1, min(5, 125 // (longest + 12)))  # of a legend below: 125 letters a line
+        lines = math.ceil((len(groups) + 1) / across) if many else 0
+        size = (9.2, 4.2 + 0.16 * lines) if many else (6.4, 3.6)
+        figure = Figure(figsize=size, layout="constrained")
         axes = figure.add_subplot()
         handles: list[Any] = []
         spots = {}
@@ -61,9 +66,14 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         axes.set_xlabel(f"{with_unit(x)} ({better(x)} is better){where}")
         axes.set_ylabel(f"{with_unit(y)}\n({better(y)} is better)")
         axes.margins(0.12)
+        plain = [spots[i] for i in spots if not results.groups[i - 1].mark] or [*spots.values()]
+        if len(plain) > 1:
+            draw_front(axes, plain, (x.better, y.better))
+            handles.append(Line2D([], [], label="Pareto front", **FRONT))
         watermark(axes, results)
-        style: dict[str, Any] = {"ncols": 2, "fontsize": 7.5, "columnspacing": 1} if many else {}
-        figure.legend(handles=handles, loc="outside right upper", **style)
+        style: dict[str, Any] = {"ncols": across, "fontsize": 7.5, "columnspacing": 1}
+        place = "outside lower center" if many else "outside right upper"
+        figure.legend(handles=handles, loc=place, **(style if many else {}))
         if many:
             _number(axes, spots)
         save(figure, out_dir, f"{y.name}_{x.name}")
@@ -265,18 +275,19 @@ def front(points: Sequence[Point], better: tuple[int, int] = (+1, +1)) -> list[i
     return sorted(kept, key=lambda index: points[index])
 
 
-def draw_front(axes: Axes, points: Sequence[Point], better: int) -> None:
+def draw_front(axes: Axes, points: Sequence[Point], better: tuple[int, int] = (+1, +1)) -> None:
     """The front as stairs from edge to edge of axes that show the points already.
 
     Args:
-        better: of the second number, +1: higher, -1: lower; of the first it is higher.
+        better: as in `front`.
 
-    Their height is the second number that can be had at the first number or more.
+    Their height is the second number that can be had at the first number or a better one.
     """
-    corners = [points[index] for index in front(points, (+1, better))]
+    corners = [points[index] for index in front(points, better)]
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    ends = (left, corners[0][1]), (corners[-1][0], low if better > 0 else high)
+    corners = corners if better[0] > 0 else corners[::-1]
+    ends = (left if better[0] > 0 else right, corners[0][1]), (corners[-1][0], low if better[1] > 0 else high)
     xs, ys = zip(ends[0], *corners, ends[1], strict=True)
-    axes.plot(xs, ys, drawstyle="steps-pre", color=GRAY, linewidth=1.2, zorder=1)
+    axes.plot(xs, ys, drawstyle="steps-pre", **FRONT)
     axes.set_xlim(left, right)
     axes.set_ylim(low, high)
