@@ -8,7 +8,7 @@ which nothing was chosen by. A line is chosen for once all its trials have ended
 
 import functools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -16,8 +16,8 @@ from typing import Any
 
 from mtl_bench.bench import store
 from mtl_bench.bench.data_state import Data
-from mtl_bench.bench.grid import Grid
-from mtl_bench.bench.jobs import CELLS
+from mtl_bench.bench.grid import Grid, baseline_cell
+from mtl_bench.bench.jobs import CELLS, Job, with_parents
 from mtl_bench.bench.references import baselines
 from mtl_bench.bench.space import draws, value_of
 from mtl_bench.core.columns import Column
@@ -104,20 +104,27 @@ def trials(grid: Grid) -> tuple[Trial, ...]:
     )
 
 
-def tried(grid: Grid, runs: Path, data: Data | None = None) -> tuple[Tried, ...]:
-    """Every trial with its score, as far as it has ended."""
-    found = [(trial, store.inspect(trial.cell, runs, data)) for trial in trials(grid)]
-    metrics = {
-        problem: _counted(s.row for t, s in found if t.problem == problem)
-        for problem in problems(grid)
-    }
+def tried(
+    grid: Grid, runs: Path, data: Data | None = None, of: Collection[str] | None = None
+) -> tuple[Tried, ...]:
+    """Every trial with its score, as far as it has ended.
+
+    Args:
+        of: problems; None: all.
+    """
+    wanted = problems(grid) if of is None else of
+    every = [trial for trial in trials(grid) if trial.problem in wanted]
+    found = [(trial, _state(trial.cell, runs, data)) for trial in every]
+    metrics = {p: _counted(s.row for t, s in found if t.problem == p) for p in wanted}
     return tuple(_judged(trial, state, metrics[trial.problem]) for trial, state in found)
 
 
-def chosen(grid: Grid, runs: Path, data: Data | None = None) -> dict[tuple[str, str], Choice]:
+def chosen(
+    grid: Grid, runs: Path, data: Data | None = None, of: Collection[str] | None = None
+) -> dict[tuple[str, str], Choice]:
     """(line, problem) -> its best trial, the first of equal ones, where all its trials ended."""
     groups: dict[tuple[str, str], dict[int, list[Tried]]] = {}
-    for each in tried(grid, runs, data):
+    for each in tried(grid, runs, data, of):
         numbers = groups.setdefault((each.trial.line, each.trial.problem), {})
         numbers.setdefault(each.trial.number, []).append(each)
     found = {}
@@ -129,9 +136,11 @@ def chosen(grid: Grid, runs: Path, data: Data | None = None) -> dict[tuple[str, 
     return found
 
 
-def finals(grid: Grid, runs: Path, data: Data | None = None) -> tuple[Final, ...]:
+def finals(
+    grid: Grid, runs: Path, data: Data | None = None, of: Collection[str] | None = None
+) -> tuple[Final, ...]:
     """The grid's cells and their baselines with the settings that were chosen, where they were."""
-    choices = chosen(grid, runs, data)
+    choices = chosen(grid, runs, data, of)
     return tuple(
         Final(*key, line.base, set_values(line.base, choices[key].trial.values), choices[key])
         for line in _lines(grid)
@@ -140,7 +149,86 @@ def finals(grid: Grid, runs: Path, data: Data | None = None) -> tuple[Final, ...
     )
 
 
+# --- running and reporting ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a problem of the grid takes, and how far it is."""
+
+    problem: str
+    trials: tuple[Tried, ...]
+    finals: tuple[Final, ...]
+    open: tuple[Cell, ...]  # of the grid, whose settings are not chosen yet
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        return (*(each.trial.cell for each in self.trials), *(each.cell for each in self.finals))
+
+    def to_try(self, again: bool) -> list[Cell]:
+        """The cells of its trials; of those that failed only where they are wanted again."""
+        return [t.trial.cell for t in self.trials if again or t.score != -math.inf]
+
+    def hours(self, todo: Sequence[Job], runs: Path) -> float | None:
+        """Expected, one cell after another; None where none is done.
+
+        Args:
+            todo: those of `cells` and of what they need that are not done.
+        """
+        return store.hours_to_run([*todo, *self.open], with_parents(self.cells), runs)
+
+
+def part(grid: Grid, problem: str, runs: Path, data: Data | None = None) -> Part:
+    """How far a problem is."""
+    found = finals(grid, runs, data, [problem])
+    known = {final.base.id for final in found}
+    bases = [line.base for line in _lines(grid) if line.problem == problem]
+    left = tuple(base for base in bases if base.id not in known)
+    return Part(problem, tried(grid, runs, data, [problem]), found, left)
+
+
+def results(
+    grid: Grid, runs: Path, data: Data | None = None
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """The rows of a report, and by cell id those that their deltas are against.
+
+    A row is that of the cell with the chosen settings, under the cell that the grid names, so that
+    lines are those of the grid; `tuned` says which settings.
+    """
+    found = {final.base.id: final for final in finals(grid, runs, data)}
+    rows = {id: _row(final, runs, data) for id, final in found.items()}
+    named = {id: {"name": name} for id, name in grid.names.items()}
+    against = {}
+    for cell in grid.cells if grid.baseline else ():
+        baseline = rows.get(baseline_cell(cell, grid.baseline).id, {})
+        if cell.id in found and "metric" in baseline:
+            against[found[cell.id].cell.id] = baseline
+    waiting = {"status": "missing", "error": "its trials have not ended"}
+    every = [
+        {**rows.get(cell.id, {**CELLS.identity(cell), **waiting}), **named.get(cell.id, {})}
+        for cell in grid.cells
+    ]
+    return every, against
+
+
+def _row(final: Final, runs: Path, data: Data | None) -> dict[str, Any]:
+    (row,) = store.rows([final.cell], runs, data=data)
+    trial = final.choice.trial
+    tuned = {"line": final.line, "problem": final.problem, "trial": trial.number}
+    tuned |= {"values": dict(trial.values), "failed": final.choice.score == -math.inf}
+    return {**row, "cell": CELLS.identity(final.base)["cell"], "tuned": tuned}
+
+
 # --- parts ----------------------------------------------------------------------------------------
+
+
+def _state(cell: Cell, runs: Path, data: Data | None) -> store.State:
+    """Of one that lacks a parent for good: failed, as that one."""
+    state = store.inspect(cell, runs, data)
+    if state.word == "missing" and cell.parents:
+        failed = (store.inspect(parent, runs, data) for parent in cell.parents)
+        return next((parent for parent in failed if parent.word == "failed"), state)
+    return state
 
 
 @dataclass(frozen=True)

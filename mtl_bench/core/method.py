@@ -55,7 +55,7 @@ class Method(nn.Module):
     reevaluates = False  # True: `after_step` gets the batch's losses under the new parameters
     # Hyper-parameters that a grid's trials tune, and where their values lie: see bench/space.py
     space: ClassVar[Mapping[str, Any]] = MappingProxyType({})
-    stage_members = {"tune": ("space",)}  # it changes no training  # noqa: RUF012
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"tune": ("space",)}
     fixed_T: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0):
