@@ -74,6 +74,8 @@ def figures() -> dict[str, str]:
         "forest": "Against the control",
         "bands": "How far ranks go",
         "profiles": "Performance profiles",
+        "budgets": "What a budget of tuning buys",
+        "tradeoff": "Trade-off of tasks, and the control's front",
         **{f"{y.name}_{x.name}": against(y, x) for y, x in pairs()},
         "samples": "Sample predictions",
         "extremes": "Worst and best frame of each row",

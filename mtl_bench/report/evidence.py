@@ -119,7 +119,7 @@ def bootstrap(
 
 
 def resampled(score_LMN: Array, resamples: int, seed: int) -> Iterator[Array]:
-    """Scores with the seeds of each problem drawn anew, jointly for all lines: [S, L, M, N] each."""
+    """Scores with the seeds of each problem drawn anew, jointly for all lines: [S, L, M, N]s."""
     _, problems, seeds = score_LMN.shape
     draws = np.random.default_rng(seed).integers(seeds, size=(resamples, 1, problems, seeds))
     for start in range(0, resamples, AT_A_TIME):

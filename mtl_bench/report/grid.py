@@ -13,13 +13,14 @@ from typing import Any
 import pandas as pd
 from markupsafe import Markup
 
+from mtl_bench.bench.tuning import Tried
 from mtl_bench.core import quality
 from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
 from mtl_bench.core.style import MANY
 from mtl_bench.report import columns as known
-from mtl_bench.report import curves, pictures, plots, protocol, verdict_plots
+from mtl_bench.report import curves, pictures, plots, protocol, trials, tuned, verdict_plots
 from mtl_bench.report.columns import (
     DELTA,
     ONLY,
@@ -65,7 +66,7 @@ from mtl_bench.train.curve import read as read_curve
 
 PUBLISHED = Path(__file__).parent / "literature.toml"
 AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
-VERDICTS = "verdicts"  # stem of their file
+VERDICTS, TRIALS = "verdicts", "trials"  # stems of their files
 WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples", "extremes")
 TRAINED_BRIEFLY = "Cells marked smoke were trained for a few steps to show that the pipeline works."
 NUMERALS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
@@ -185,7 +186,6 @@ def tabulate(
     rows: Sequence[Row],
     layout: Layout | None = None,
     baseline: Row | None = None,
-    tuned: Collection[str] = (),
     problem: str = "",
 ) -> Results:
     """Group rows by everything but the seed, and say which group leads each column.
@@ -195,11 +195,10 @@ def tabulate(
         layout: which field of a cell names a line (others join it where they differ), which
             columns there are and how they are ordered.
         baseline: metrics of the trivial predictor.
-        tuned: keys of a cell that trials chose, and that name no line.
         problem: the recipe's name where the grid has several, and these are the rows of one.
     """
     layout = layout or Layout()
-    axes = axes_of([row for row in rows if row.get("status", "done") in SHOWN], layout.rows, tuned)
+    axes = axes_of([row for row in rows if row.get("status", "done") in SHOWN], layout.rows)
     trivial = None if baseline is None or layout.only else trivial_group(baseline, axes)
     groups = grouped(rows, axes, trivial, layout.reference, layout.control)
     return Results(
@@ -476,11 +475,13 @@ def build(
     runs_root: Path | None = None,
     baseline: Row | None = None,
     command: str = "",
+    tried: Sequence[Tried] = (),
 ) -> Path:
     """Write the page, the tables and the figures; the same rows give the same bytes.
 
-    The tables are `table.{csv,md,tex}` whole, `readme.md` with the main columns, and with a control
-    `verdicts.csv`. A suite has quality and cost of each problem, and figures under its name.
+    The tables are `table.{csv,md,tex}` whole, `readme.md` with the main columns, with a control
+    `verdicts.csv`, and of a grid that is tuned `trials.csv`. A suite has quality and cost of each
+    problem, and figures under its name.
 
     Args:
         grid: its name, question, recipe, and under `report` what `Layout` says.
@@ -490,6 +491,7 @@ def build(
         runs_root: where the runs' curves and samples are; without it those figures are left out.
         baseline: the trivial predictor's metrics, under the same keys as a row's.
         command: what reproduces the report.
+        tried: the trials of a grid that is tuned.
 
     Returns:
         The page's path.
@@ -502,14 +504,14 @@ def build(
     baseline = baseline if has_section else {"metric": baseline}
     rows = [*rows, *_skipped(grid)]
     problems = [
-        tabulate(own, layout, baseline, (), name) for name, own in by_problem(rows, layout).items()
+        tabulate(own, layout, baseline, name) for name, own in by_problem(rows, layout).items()
     ]
     judged = judge(rows, layout.rows, layout.control) if layout.control is not None else None
-    with beside(out_dir, (*known.figures(), VERDICTS)) as folder:
-        figures = _figures_of_verdicts(judged, folder) if judged is not None else []
+    with beside(out_dir, (*known.figures(), VERDICTS, TRIALS)) as folder:
+        figures = [] if judged is None else _figures_of_verdicts(judged, tried, folder)
         for results in () if layout.only else problems:
             figures += _figures_of(results, folder, runs_root)
-        _write(grid, rows, problems, judged, figures, folder, command)
+        _write(grid, rows, problems, judged, tried, figures, folder, command)
     return out_dir / PAGE
 
 
@@ -518,6 +520,7 @@ def _write(
     rows: Sequence[Row],
     problems: Sequence[Results],
     judged: Verdicts | None,
+    tried: Sequence[Tried],
     figures: Sequence[Figure],
     folder: Path,
     command: str,
@@ -525,10 +528,12 @@ def _write(
     table = together([fill(results) for results in problems])
     brief = together([fill(results, short=True) for results in problems])
     groups = [group for results in problems for group in results.groups]
-    control = Layout.of(grid.report).control
-    more = {}
+    control, tune = Layout.of(grid.report).control, getattr(grid, "tune", None)
+    more = {f"{TRIALS}.csv": trials.records(tried)} if tried else {}
     if judged is not None:
-        first, said = tuple(sections(judged)), tuple(notes(judged))
+        first, said = sections(judged, tune), tuple(notes(judged))
+        behind = trials.distances(judged, trials.ended(tried))
+        first += [] if behind is None else [behind]
         table = replace(table, sections=(*first, *table.sections), notes=(*said, *table.notes))
         rest = brief.sections if len(problems) == 1 else ()  # those of many problems: on the page
         brief = replace(brief, sections=(*first, *rest), notes=(*said, *brief.notes))
@@ -536,6 +541,8 @@ def _write(
     elif control is not None:
         lines = [", ".join(group.identity) for group in groups]
         table = replace(table, notes=(*table.notes, untested(control, lines)))
+    if tune is not None:
+        table = replace(table, sections=(*table.sections, tuned.section(rows, tune)))
     counts = [counted_images(results) for results in problems]
     page = Page(
         kind="grid",
@@ -559,15 +566,24 @@ def _write(
     write(table, folder, more)
 
 
-def _figures_of_verdicts(judged: Verdicts, folder: Path) -> list[Figure]:
-    """Those of all problems together."""
+def _figures_of_verdicts(judged: Verdicts, tried: Sequence[Tried], folder: Path) -> list[Figure]:
+    """Those of all problems together, and of trials each problem's trade-off."""
+    settings = trials.ended(tried)
     drawn = {
         "forest": verdict_plots.forest(judged, folder, "forest"),
         "bands": verdict_plots.bands(judged, folder, "bands"),
         "profiles": verdict_plots.profiles(judged, folder, "profiles"),
+        "budgets": trials.budgets(judged, settings, folder, "budgets"),
     }
     wide = len(judged.problems) > 1 or len(judged.lines) > MANY
-    return [replace(figure, wide=wide) for figure in figures_of(known.figures(), drawn)]
+    found = [replace(figure, wide=wide) for figure in figures_of(known.figures(), drawn)]
+    for problem in judged.problems:
+        stem = f"{problem.replace(', ', '-')}-tradeoff" if len(judged.problems) > 1 else "tradeoff"
+        caption = trials.tradeoff(judged, settings, problem, folder, stem)
+        if caption is not None:
+            heading = ": ".join(filter(None, (problem, known.figures()["tradeoff"].lower())))
+            found.append(Figure(stem, capital(heading), caption, wide=True))
+    return found
 
 
 def _figures_of(results: Results, folder: Path, runs_root: Path | None) -> list[Figure]:

@@ -286,8 +286,9 @@ def draw_front(axes: Axes, points: Sequence[Point], better: tuple[int, int] = (+
     corners = [points[index] for index in front(points, better)]
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     corners = corners if better[0] > 0 else corners[::-1]
-    ends = (left if better[0] > 0 else right, corners[0][1]), (corners[-1][0], low if better[1] > 0 else high)
-    xs, ys = zip(ends[0], *corners, ends[1], strict=True)
+    first = (left if better[0] > 0 else right, corners[0][1])
+    last = (corners[-1][0], low if better[1] > 0 else high)
+    xs, ys = zip(first, *corners, last, strict=True)
     axes.plot(xs, ys, drawstyle="steps-pre", **FRONT)
     axes.set_xlim(left, right)
     axes.set_ylim(low, high)

@@ -4,7 +4,7 @@ import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -95,21 +95,16 @@ def by_recipe(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return found
 
 
-def axes_of(rows: Sequence[Row], axis: str, tuned: Collection[str] = ()) -> tuple[str, ...]:
+def axes_of(rows: Sequence[Row], axis: str) -> tuple[str, ...]:
     """The row axis and whatever else differs between the cells, best known first.
 
     Cells of different names differ by design, and their names say how: what joins the names is
     what differs between cells of one name.
-
-    Args:
-        tuned: keys of a cell, or of its sections, that were chosen for each line by trials: they
-            are no axes.
     """
     alike: dict[str, list[dict[str, Any]]] = {}
     for cell in map(cell_of, rows):
         alike.setdefault(str(cell.get("name")) if axis == "name" else "", []).append(cell)
     keys = sorted({key for cells in alike.values() for cell in cells for key in cell})
-    keys = [key for key in keys if not any(f"{key}.".startswith(f"{own}.") for own in tuned)]
     varying = [key for key in keys if any(_varies(cells, key) for cells in alike.values())]
     if "recipe.name" in varying:  # two recipes differ in much; their names say it
         varying = [k for k in varying if k == "recipe.name" or not k.startswith("recipe.")]

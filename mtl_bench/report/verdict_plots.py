@@ -3,7 +3,7 @@
 Colour is the verdict; in the profiles, the line.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,7 @@ def forest(found: Verdicts, out_dir: Path, name: str) -> str | None:
         every[0].set_ylim(len(labels) - 0.4, -0.6)
         _verdict_legend(figure, [c for several in panels.values() for c in several])
         figure.supxlabel(f"difference of gain to {found.control.label}, points", fontsize=9)
-        _warn(figure, found)
+        warn(figure, found)
         save(figure, out_dir, name)
     own = "" if one else " Each panel has its own scale."
     return (
@@ -72,7 +72,7 @@ def profiles(found: Verdicts, out_dir: Path, name: str) -> str | None:
     finite = of.gain_LMN[np.isfinite(of.gain_LMN)]
     if not len(finite):
         return None
-    tau_T = np.unique(np.clip(finite, *_middle(finite, finite)))
+    tau_T = np.unique(np.clip(finite, *middle(finite, finite)))
     with styled():
         figure = Figure(figsize=(8.4, 4.2), layout="constrained")
         axes = figure.add_subplot()
@@ -84,7 +84,7 @@ def profiles(found: Verdicts, out_dir: Path, name: str) -> str | None:
         axes.set_ylabel("share of runs above it")
         axes.set_ylim(-0.02, 1.02)
         line_legend(figure, found)
-        _warn(figure, found)
+        warn(figure, found)
         save(figure, out_dir, name)
     return (
         f"Performance profiles: share of a line's runs ({_suite(found)}) whose gain is above a "
@@ -123,7 +123,7 @@ def bands(found: Verdicts, out_dir: Path, name: str) -> str | None:
             Line2D([], [], linewidth=1.6, label=choices, **shown),
         ]
         _verdict_legend(figure, [line.comparison for line in found.lines], more)
-        _warn(figure, found)
+        warn(figure, found)
         save(figure, out_dir, name)
     left_out = " and with each problem left out" if len(found.problems) > 1 else ""
     return (
@@ -161,9 +161,19 @@ def line_of(look: Look) -> dict[str, Any]:
     return style | {"zorder": 1 if faint else 2}
 
 
-def line_legend(figure: Figure, found: Verdicts) -> None:
-    """The lines with a colour, the best first, and how many have none."""
-    every = highlighted(found)
+def line_legend(
+    figure: Figure,
+    found: Verdicts,
+    drawn: Collection[str] | None = None,
+    more: Sequence[Line2D] = (),
+) -> None:
+    """The lines with a colour, the best first, and how many have none.
+
+    Args:
+        drawn: the lines that the figure has; None: all.
+        more: what it has besides.
+    """
+    every = [item for item in highlighted(found) if drawn is None or item[0] in drawn]
     handles = [
         Line2D([], [], label=label, **line_of(look))
         for label, look in reversed(every)
@@ -172,7 +182,7 @@ def line_legend(figure: Figure, found: Verdicts) -> None:
     others = sum(look.color == FAINT for _, look in every)
     if others:
         handles.append(Line2D([], [], label=f"{others} others", **line_of(every[0][1])))
-    figure.legend(handles=handles, loc="outside right upper")
+    figure.legend(handles=[*handles, *more], loc="outside right upper")
 
 
 def said_of_colors(found: Verdicts) -> str:
@@ -189,7 +199,7 @@ def _intervals(axes: Axes, compared: Sequence[Comparison]) -> None:
     lows = np.array([np.fmin(c.difference.low, c.difference.mean) for c in known])
     highs = np.array([np.fmax(c.difference.high, c.difference.mean) for c in known])
     margin = evidence.MARGIN
-    left, right = _middle(lows, highs) if known else (-margin, margin)
+    left, right = middle(lows, highs) if known else (-margin, margin)
     left, right = min(left, -1.3 * margin), max(right, 1.3 * margin)
     room = 0.04 * (right - left)
     axes.set_xlim(left - room, right + room)
@@ -213,7 +223,7 @@ def _intervals(axes: Axes, compared: Sequence[Comparison]) -> None:
             axes.text(left, place, said, va="center", fontsize=7, color=COLORS["worse"])
 
 
-def _middle(lows: Array, highs: Array) -> tuple[float, float]:
+def middle(lows: Array, highs: Array) -> tuple[float, float]:
     """The range of all, without those far out: beyond 1.5 times the middle half's width."""
     first, third = float(np.percentile(lows, 25)), float(np.percentile(highs, 75))
     room = 1.5 * max(third - first, 2 * evidence.MARGIN)
@@ -233,7 +243,7 @@ def _verdict_legend(
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
 
 
-def _warn(figure: Figure, found: Verdicts) -> None:
+def warn(figure: Figure, found: Verdicts) -> None:
     if found.smoke:
         figure.suptitle(SMOKE, color="#a40000")
 

@@ -8,9 +8,10 @@ as the worst, a missing one leaves its block out. The other lines are the family
 import csv
 import io
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from mtl_bench.report.columns import DELTA, Row, column, measured, text
 from mtl_bench.report.evidence import Array, Comparison, Estimate
 from mtl_bench.report.statistics import axes_of, by_recipe, cell_of, own_and_shared
 from mtl_bench.report.table import FEWER, Cell, Head, Section, TableRow
+from mtl_bench.report.tuned import note
 
 VERDICTS = ("better", "worse", "equivalent", "open")
 MARK = "*"  # behind a difference whose p by Holm is at most 0.05
@@ -75,19 +77,16 @@ class Verdicts:
         return sorted(known, key=lambda line: line.rank)
 
 
-def judge(
-    rows: Sequence[Row], axis: str, control: str, tuned: Collection[str] = ()
-) -> Verdicts | None:
+def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
     """Hold every line of a grid against one; None where no other shares two blocks with it.
 
     Args:
         rows: with `delta.gain` among their metrics where they are done; failed ones, too.
         axis: the field of a cell that names a line.
         control: its value that the others are held against.
-        tuned: keys of a cell that trials chose, and that name no line.
     """
     rows = [row for row in rows if row.get("status", "done") in ("done", "failed")]
-    of = scores(rows, axis, tuned)
+    of = scores(rows, axis)
     if control not in of.labels:
         return None
     at = of.labels.index(control)
@@ -124,12 +123,12 @@ def judge(
     return Verdicts(found[at], tuple(lines), of, smoke)
 
 
-def scores(rows: Sequence[Row], axis: str, tuned: Collection[str] = ()) -> Scores:
+def scores(rows: Sequence[Row], axis: str) -> Scores:
     """Every run's numbers in their places.
 
     A line whose finished runs have no gain, as the baseline's, is none; one of failed runs is.
     """
-    named = list(_named(rows, axis, tuned))
+    named = list(_named(rows, axis))
     gains = {
         line: of
         for line, of in _by_block(named, _gain).items()
@@ -160,9 +159,13 @@ def scores(rows: Sequence[Row], axis: str, tuned: Collection[str] = ()) -> Score
 # --- what is said of it ---------------------------------------------------------------------------
 
 
-def sections(found: Verdicts) -> list[Section]:
-    """The whole comparison, then problem by problem where there are several."""
-    return [_over_all(found), *([_by_problem(found)] if len(found.problems) > 1 else [])]
+def sections(found: Verdicts, tune: Any = None) -> list[Section]:
+    """The whole comparison, then problem by problem where there are several.
+
+    Args:
+        tune: the grid's section [tune].
+    """
+    return [_over_all(found, tune), *([_by_problem(found)] if len(found.problems) > 1 else [])]
 
 
 def sentence(found: Verdicts) -> str:
@@ -177,6 +180,26 @@ def sentence(found: Verdicts) -> str:
         f"{control}{suite}{at}, {len(of['equivalent'])} {_are(of['equivalent'])} equivalent within "
         f"{evidence.MARGIN:g} point, {len(of['worse'])} {_are(of['worse'])} worse, "
         f"{len(of['open'])} {_are(of['open'])} open."
+    )
+
+
+def protocol(found: Verdicts, tune: Any = None) -> str:
+    """How the comparison was made, for a paper: budget, results, test, margin.
+
+    Args:
+        tune: the grid's section [tune].
+    """
+    budget = (
+        "Untuned: every line has the settings that the grid gives it, published ones or its own."
+    )
+    blocks = max(line.comparison.blocks for line in found.lines)
+    seeds = ", ".join(map(str, found.scores.seeds))
+    several = f" x {len(found.problems)} problems" if len(found.problems) > 1 else ""
+    return (
+        f"{budget if tune is None else note(tune)} Results: seeds {seeds}{several}, n = {blocks} "
+        f"blocks; family: {len(found.lines)} line{'s' * (len(found.lines) > 1)} against "
+        f"{found.control.label}, sign-flip test, two-sided, by Holm at "
+        f"{1 - evidence.LEVEL:.2g}; margin of equivalence: {evidence.MARGIN:g} point."
     )
 
 
@@ -271,13 +294,11 @@ def band(line: Line) -> tuple[float, float]:
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _named(
-    rows: Sequence[Row], axis: str, tuned: Collection[str]
-) -> Iterator[tuple[str, str, Row]]:
+def _named(rows: Sequence[Row], axis: str) -> Iterator[tuple[str, str, Row]]:
     """Line, problem and row: a problem's name is its recipe's where there are several, and what
     else makes it one."""
     recipes = by_recipe(rows)
-    axes = {name: axes_of(several, axis, tuned) for name, several in recipes.items()}
+    axes = {name: axes_of(several, axis) for name, several in recipes.items()}
     parts = {name: own_and_shared(several) for name, several in axes.items()}
     own = dict.fromkeys(axes[name][i] for name in recipes for i in parts[name][0])
     for name, several in recipes.items():
@@ -286,7 +307,8 @@ def _named(
             cell = cell_of(row)
             line = ", ".join(text(cell.get(key)) for key in own)
             named = [name] * (len(recipes) > 1) + [text(cell.get(key)) for key in shared]
-            yield line, ", ".join(named), row
+            tuned = row.get("tuned", {})  # what trials were of is called by them
+            yield tuned.get("line", line), tuned.get("problem", ", ".join(named)), row
 
 
 def _by_block(named: Sequence[tuple[str, str, Row]], value: Callable[[Row], float]) -> Blocks:
@@ -326,7 +348,7 @@ def _ratio(step_MN: Array, control_MN: Array) -> float:
     return float(np.mean(step_MN[both] / control_MN[both])) if both.any() else math.nan
 
 
-def _over_all(found: Verdicts) -> Section:
+def _over_all(found: Verdicts, tune: Any) -> Section:
     """A line each: difference with its interval, P(X > Y), p by Holm, verdict, rank, cost."""
     control = found.control.label
     most = max(line.comparison.blocks for line in found.lines)
@@ -347,8 +369,10 @@ def _over_all(found: Verdicts) -> Section:
         heading=f"Against {control}",
         heads=heads,
         lines=(*(_table_row(line, most) for line in found.lines), own),
-        source=sentence(found),
-        caption=f"Against {control}. {sentence(found)} {' '.join(notes(found))}",
+        source=f"{sentence(found)} {protocol(found, tune)}",
+        caption=" ".join(
+            [f"Against {control}.", sentence(found), protocol(found, tune), *notes(found)]
+        ),
     )
 
 

@@ -117,16 +117,14 @@ def test_a_failed_baseline_is_no_line(rows):
     assert (line.label, line.comparison.verdict, line.comparison.failed) == ("behind", "worse", 15)
 
 
-def test_what_trials_chose_names_no_line(rows):
+def test_tuned_lines_are_called_as_their_trials(rows):
     rows = json.loads(json.dumps(rows))
-    for i, row in enumerate(rows):
-        row["cell"]["method_args"] = {"alpha": i}
-        row["cell"]["recipe"]["optim"]["lr"] = 0.1 * (i + 1)
-    tuned = {"method_args.alpha", "recipe.optim.lr"}
-    found = judge(rows, "method", CONTROL, tuned)
-    assert {line.label for line in found.lines} == set(LINES)
-    (name, own), *_ = by_problem(rows, Layout(rows="method")).items()
-    assert tabulate(own, Layout(rows="method"), tuned=tuned, problem=name).axes == ("method",)
+    for row in rows:  # as results of trials say it
+        tuned = {"line": f"the {row['method']}", "problem": f"{row['cell']['recipe']['name']}, a"}
+        row["tuned"] = tuned | {"trial": 1, "values": {"recipe.optim.lr": 0.1}, "failed": False}
+    found = judge(rows, "method", f"the {CONTROL}")
+    assert {line.label for line in found.lines} == {f"the {line}" for line in LINES}
+    assert found.problems == tuple(f"{problem}, a" for problem in PROBLEMS)
 
 
 def test_bold_leads_the_control_by_a_test(rows):

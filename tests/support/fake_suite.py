@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 from fake_rows import make_row
 
+from mtl_bench.bench.tuning import Trial, Tried
 from mtl_bench.core import config
 from mtl_bench.report.delta import with_delta
 
@@ -56,6 +57,31 @@ def suite_rows(lines, seeds=5, problems=PROBLEMS, noise=0.4):
         if row["method"] == "baseline"
     }
     return with_delta(rows, lambda row: baseline[row["cell"]["recipe"]["name"], row["seed"]])
+
+
+def suite_trials(lines, trials=6, problems=PROBLEMS, failed=()):
+    """Line -> its best points of gain; trials of the control trade its tasks.
+
+    Args:
+        failed: (line, number) of trials that failed on every problem.
+    """
+    rng = np.random.default_rng(4)
+    found = []
+    for recipe, metrics in problems.items():
+        tasks = list(dict.fromkeys(key.split(".")[0] for key in metrics))
+        tasks = tasks if len(tasks) > 1 else [key.rpartition(".")[0] for key in metrics]
+        for line, shift in {CONTROL: 0.0, **lines}.items():
+            for number in range(trials):
+                trade = rng.normal(0, 4 if line == CONTROL else 1, len(tasks))
+                scores = shift + trade - trade.mean() - rng.exponential(3)
+                cell = config.Cell(config.Recipe(name=recipe), f"net_{recipe}", line, seed=100)
+                values = {"recipe.optim.lr": 0.1 / (number + 1)} if number else {}
+                trial = Trial(line, recipe, number, cell, values)
+                bad = (line, number) in failed
+                of = {} if bad else dict(zip(tasks, map(float, scores), strict=True))
+                score = -np.inf if bad else float(np.mean(scores))
+                found.append(Tried(trial, score, of, 0.0 if bad else 10.0 + 5 * (shift > 0)))
+    return found
 
 
 def fail(row):
