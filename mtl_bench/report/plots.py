@@ -14,6 +14,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from mtl_bench.core.columns import FPS, Column
@@ -66,6 +67,8 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         axes.set_xlabel(f"{with_unit(x)} ({better(x)} is better){where}")
         axes.set_ylabel(f"{with_unit(y)}\n({better(y)} is better)")
         axes.margins(0.12)
+        outside = _zoom(axes, groups, x, y) if many else []
+        spots = {i: s for i, s in spots.items() if results.groups[i - 1] not in outside}
         plain = [spots[i] for i in spots if not results.groups[i - 1].mark] or [*spots.values()]
         if len(plain) > 1:
             draw_front(axes, plain, (x.better, y.better))
@@ -78,7 +81,9 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
             _number(axes, spots)
         save(figure, out_dir, f"{y.name}_{x.name}")
     if many:
-        return f"{y.title} against {x.title}; the numbers are those of the legend."
+        far = [f"{g.label} {_short(g, y)} at {_short(g, x)}" for g in outside]
+        more = f" Further out: {'; '.join(far)}." if far else ""
+        return f"{y.title} against {x.title}; the numbers are those of the legend.{more}"
     points = "; ".join(f"{g.label} {_short(g, y)} at {_short(g, x)} {x.title}" for g in groups)
     return f"{y.title} against {x.title}. {points}."
 
@@ -176,6 +181,21 @@ def _point(axes: Axes, group: Group, across: Column, down: Column, look: Look) -
     )
 
 
+def _zoom(axes: Axes, groups: Sequence[Group], x: Column, y: Column) -> list[Group]:
+    """Show the range of most groups; those outside it."""
+    limits = {}
+    for column, set_limits in ((x, axes.set_xlim), (y, axes.set_ylim)):
+        means = [group.entries[column.name].mean for group in groups]
+        low, high = limits[column] = middle(means, means)
+        room = 0.12 * (high - low) or 1.0
+        set_limits(low - room, high + room)
+    return [
+        group
+        for group in groups
+        if any(not low <= group.entries[c.name].mean <= high for c, (low, high) in limits.items())
+    ]
+
+
 def _number(axes: Axes, spots: Mapping[int, tuple[float, float]]) -> None:
     """A number beside each point, at the nearest place that is free of points and numbers."""
     figure = axes.get_figure(root=True)
@@ -246,6 +266,26 @@ def _merged(several: Iterable[Iterable[str]]) -> list[str]:
                 found.insert(place, name)
             place = found.index(name) + 1
     return found
+
+
+def plain_log(axes: Axes, label: str) -> None:
+    """A logarithmic x axis with 1, 2, 5, 10 in plain digits."""
+    axes.set_xscale("log")
+    axes.set_xlabel(label)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def middle(lows: Sequence[float], highs: Sequence[float], least: float = 0.0) -> Point:
+    """The range of all, without those far out: beyond 1.5 times the middle half's width.
+
+    Args:
+        least: what a width is taken for at least.
+    """
+    first, third = float(np.percentile(lows, 25)), float(np.percentile(highs, 75))
+    room = 1.5 * max(third - first, least)
+    return max(float(np.min(lows)), first - room), min(float(np.max(highs)), third + room)
 
 
 def watermark(axes: Axes, results: "Results") -> None:

@@ -24,14 +24,13 @@ from mtl_bench.bench.tuning import SPLIT, Tried
 from mtl_bench.core.style import save, styled
 from mtl_bench.report import evidence
 from mtl_bench.report.evidence import Array
-from mtl_bench.report.plots import FRONT, draw_front
+from mtl_bench.report.plots import FRONT, draw_front, middle, plain_log
 from mtl_bench.report.table import NOTHING, Cell, Head, Section, TableRow
 from mtl_bench.report.verdict_plots import (
-    FAINT,
     highlighted,
     line_legend,
     line_of,
-    middle,
+    point_of,
     said_of_colors,
     warn,
 )
@@ -94,8 +93,7 @@ def budgets(found: Verdicts, settings: Settings, out_dir: Path, name: str) -> st
         left.set_ylim(low - room, high + room)
         left.set_xticks(range(1, trials + 1))
         left.set_xlabel("trials" + " a problem" * (len(problems) > 1))
-        right.set_xscale("log")
-        right.set_xlabel("seconds of training and evaluation")
+        plain_log(right, "seconds of training and evaluation")
         left.set_ylabel(f"expected best of them, points over\n{control}'s best ({SPLIT})")
         line_legend(figure, found, set(curves))
         warn(figure, found)
@@ -141,7 +139,7 @@ def tradeoff(
             axes.set_xlabel(f"{tasks[pair[0]]}, points")
             axes.set_ylabel(f"{tasks[pair[1]]}, points")
         handle = Line2D([], [], label=f"{control}'s trials: front", **FRONT)
-        line_legend(figure, found, set(points), [handle])
+        line_legend(figure, found, set(points), [handle], point_of)
         warn(figure, found)
         save(figure, out_dir, name)
     chosen = f" The {len(pairs)} pairs of {len(tasks)} tasks that trade most." * (len(tasks) > 2)
@@ -272,13 +270,10 @@ def _pairs(tasks: Sequence[str], score_TK: Array) -> list[tuple[int, int]]:
 def _scatter(axes: Axes, points: Sequence[tuple[Array, Any]]) -> None:
     """The lines' points; those far out stand at the edge."""
     every = np.array([point for point, _ in points])
-    limits = [middle(each, each) for each in every.T]
+    limits = [middle(each, each, evidence.MARGIN) for each in every.T]
     for point, look in points:
         inside = [float(np.clip(v, *ends)) for v, ends in zip(point, limits, strict=True)]
-        faint = look.color == FAINT
-        size = 4.5 if faint else 8 if look.color == "#000000" else 6.5
-        marker = "D" if look.color == "#000000" else "o"
-        axes.plot(*inside, marker, color=look.color, markersize=size, zorder=2 + (not faint))
+        axes.plot(*inside, **point_of(look))
     for (low, high), set_limits in zip(limits, (axes.set_xlim, axes.set_ylim), strict=True):
         room = 0.06 * (high - low) or 1.0
         set_limits(low - room, high + room)

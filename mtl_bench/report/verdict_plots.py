@@ -3,7 +3,7 @@
 Colour is the verdict; in the profiles, the line.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from mtl_bench.core.style import BASELINE, GRAY, MANY, PALETTE, Look, looks, save, styled
+from mtl_bench.core.style import BASELINE, GRAY, PALETTE, Look, looks, save, styled
 from mtl_bench.report import evidence
-from mtl_bench.report.evidence import Array, Comparison
+from mtl_bench.report.evidence import Comparison
+from mtl_bench.report.plots import middle
 from mtl_bench.report.statistics import SMOKE
 from mtl_bench.report.table import PLUS_MINUS
 from mtl_bench.report.verdicts import ALL, VERDICTS, Verdicts, sentence
@@ -72,7 +73,7 @@ def profiles(found: Verdicts, out_dir: Path, name: str) -> str | None:
     finite = of.gain_LMN[np.isfinite(of.gain_LMN)]
     if not len(finite):
         return None
-    tau_T = np.unique(np.clip(finite, *middle(finite, finite)))
+    tau_T = np.unique(np.clip(finite, *middle(finite, finite, evidence.MARGIN)))
     with styled():
         figure = Figure(figsize=(8.4, 4.2), layout="constrained")
         axes = figure.add_subplot()
@@ -142,14 +143,14 @@ def highlighted(found: Verdicts) -> list[tuple[str, Look]]:
     best = [line.label for line in found.ranked if line is not found.control]
     rest = [line.label for line in found.lines if line.label not in best]
     own = [*best, *rest]
-    few = own if len(own) < MANY else best[:LEADERS]
+    few = own if len(own) <= LEADERS else best[:LEADERS]
     colors = [color for color in PALETTE if color != "#000000"]
     given = {
-        label: Look(colors[i % len(colors)], "", look.dash)
+        label: Look(colors[i], look.marker, look.dash)
         for i, (label, look) in enumerate(looks(few).items())
     }
-    given[found.control.label] = Look("#000000", "", "-")
-    gray = [(label, Look(FAINT, "", "-")) for label in own if label not in given]
+    given[found.control.label] = Look("#000000", "*", "-")
+    gray = [(label, Look(FAINT, "o", "-")) for label in own if label not in given]
     return [*gray, *reversed(given.items())]
 
 
@@ -161,27 +162,38 @@ def line_of(look: Look) -> dict[str, Any]:
     return style | {"zorder": 1 if faint else 2}
 
 
+def point_of(look: Look) -> dict[str, Any]:
+    """How a point is drawn."""
+    size = {FAINT: 4.5, "#000000": 11.0}.get(look.color, 6.5)
+    style = {"color": look.color, "marker": look.marker, "markersize": size, "linestyle": ""}
+    return style | {"zorder": 2 if look.color == FAINT else 3}
+
+
 def line_legend(
     figure: Figure,
     found: Verdicts,
     drawn: Collection[str] | None = None,
     more: Sequence[Line2D] = (),
+    style: Callable[[Look], dict[str, Any]] = line_of,
 ) -> None:
     """The lines with a colour, the best first, and how many have none.
 
     Args:
         drawn: the lines that the figure has; None: all.
         more: what it has besides.
+        style: `line_of` or `point_of`.
     """
     every = [item for item in highlighted(found) if drawn is None or item[0] in drawn]
     handles = [
-        Line2D([], [], label=label, **line_of(look))
+        Line2D([], [], label=label, **style(look))
         for label, look in reversed(every)
         if look.color != FAINT
     ]
     others = sum(look.color == FAINT for _, look in every)
     if others:
-        handles.append(Line2D([], [], label=f"{others} others", **line_of(every[0][1])))
+        handles.append(
+            Line2D([], [], label=f"{others} other{'s' * (others > 1)}", **style(every[0][1]))
+        )
     figure.legend(handles=[*handles, *more], loc="outside right upper")
 
 
@@ -199,7 +211,7 @@ def _intervals(axes: Axes, compared: Sequence[Comparison]) -> None:
     lows = np.array([np.fmin(c.difference.low, c.difference.mean) for c in known])
     highs = np.array([np.fmax(c.difference.high, c.difference.mean) for c in known])
     margin = evidence.MARGIN
-    left, right = middle(lows, highs) if known else (-margin, margin)
+    left, right = middle(lows, highs, 2 * margin) if known else (-margin, margin)
     left, right = min(left, -1.3 * margin), max(right, 1.3 * margin)
     room = 0.04 * (right - left)
     axes.set_xlim(left - room, right + room)
@@ -221,13 +233,6 @@ def _intervals(axes: Axes, compared: Sequence[Comparison]) -> None:
         elif each.failed:
             said = f"{each.failed} failed"
             axes.text(left, place, said, va="center", fontsize=7, color=COLORS["worse"])
-
-
-def middle(lows: Array, highs: Array) -> tuple[float, float]:
-    """The range of all, without those far out: beyond 1.5 times the middle half's width."""
-    first, third = float(np.percentile(lows, 25)), float(np.percentile(highs, 75))
-    room = 1.5 * max(third - first, 2 * evidence.MARGIN)
-    return max(float(np.min(lows)), first - room), min(float(np.max(highs)), third + room)
 
 
 def _verdict_legend(

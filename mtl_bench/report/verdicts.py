@@ -438,7 +438,8 @@ def _difference(each: Comparison) -> Cell:
 
 
 def _marked(each: Comparison) -> str:
-    return _signed(each.difference.mean) + MARK * (each.verdict in ("better", "worse"))
+    told = each.verdict in ("better", "worse") and math.isfinite(each.difference.mean)
+    return _signed(each.difference.mean) + MARK * told
 
 
 def _rank(line: Line) -> Cell:
