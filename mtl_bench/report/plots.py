@@ -57,7 +57,7 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         for index, (group, look) in enumerate(looks_of(results), 1):
             if group in groups:
                 spots[index] = (group.entries[x.name].mean, group.entries[y.name].mean)
-                _point(axes, group, x, y, look)
+                _point(axes, group, x, y, look, 0.35 if many else 1.0)
                 label = f"{index} " * many + f"{group.label} (n={len(group.rows)})"
                 handles.append(Line2D([], [], linestyle="", label=label, **_marker(group, look)))
         if x == FPS and results.baseline and results.baseline.entries[y.name].count:
@@ -167,7 +167,9 @@ def _short(group: Group, column: Column) -> str:
     return number(group.entries[column.name].mean, column)
 
 
-def _point(axes: Axes, group: Group, across: Column, down: Column, look: Look) -> None:
+def _point(
+    axes: Axes, group: Group, across: Column, down: Column, look: Look, opaque: float
+) -> None:
     x, y = group.entries[across.name], group.entries[down.name]
     axes.errorbar(
         x.mean,
@@ -176,6 +178,7 @@ def _point(axes: Axes, group: Group, across: Column, down: Column, look: Look) -
         yerr=None if math.isnan(y.std) else y.std,
         linestyle="",
         elinewidth=1.2,
+        ecolor=(look.color, opaque),
         capsize=2.5,
         **_marker(group, look),
     )
