@@ -208,7 +208,8 @@ def _signs(blocks: int) -> Array:
         bits_SB = np.arange(2**blocks)[:, None] >> np.arange(blocks) & 1
     else:
         bits_SB = np.random.default_rng(0).integers(2, size=(FLIPS, blocks))
-    return 1.0 - 2 * bits_SB
+    signs_SB: Array = 1.0 - 2 * bits_SB
+    return signs_SB
 
 
 def student(d_B: Array) -> float:

@@ -74,9 +74,10 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
             draw_front(axes, plain, (x.better, y.better))
             handles.append(Line2D([], [], label="Pareto front", **FRONT))
         watermark(axes, results)
-        style: dict[str, Any] = {"ncols": across, "fontsize": 7.5, "columnspacing": 1}
-        place = "outside lower center" if many else "outside right upper"
-        figure.legend(handles=handles, loc=place, **(style if many else {}))
+        style: dict[str, Any] = {"loc": "outside right upper"}
+        if many:
+            style = {"loc": "outside lower center", "ncols": across, "fontsize": 7.5}
+        figure.legend(handles=handles, **style)
         if many:
             _number(axes, spots)
         save(figure, out_dir, f"{y.name}_{x.name}")
@@ -186,17 +187,13 @@ def _point(
 
 def _zoom(axes: Axes, groups: Sequence[Group], x: Column, y: Column) -> list[Group]:
     """Show the range of most groups; those outside it."""
-    limits = {}
-    for column, set_limits in ((x, axes.set_xlim), (y, axes.set_ylim)):
-        means = [group.entries[column.name].mean for group in groups]
-        low, high = limits[column] = middle(means, means)
-        room = 0.12 * (high - low) or 1.0
-        set_limits(low - room, high + room)
-    return [
-        group
-        for group in groups
-        if any(not low <= group.entries[c.name].mean <= high for c, (low, high) in limits.items())
-    ]
+    means = np.array([[group.entries[c.name].mean for c in (x, y)] for group in groups])
+    (left, right), (low, high) = (middle(several, several) for several in means.T)
+    across, up = 0.12 * (right - left) or 1.0, 0.12 * (high - low) or 1.0
+    axes.set_xlim(left - across, right + across)
+    axes.set_ylim(low - up, high + up)
+    shown = np.all((means >= (left, low)) & (means <= (right, high)), axis=1)
+    return [group for group, inside in zip(groups, shown, strict=True) if not inside]
 
 
 def _number(axes: Axes, spots: Mapping[int, tuple[float, float]]) -> None:
@@ -280,7 +277,7 @@ def plain_log(axes: Axes, label: str) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def middle(lows: Sequence[float], highs: Sequence[float], least: float = 0.0) -> Point:
+def middle(lows: NDArray[np.float64], highs: NDArray[np.float64], least: float = 0.0) -> Point:
     """The range of all, without those far out: beyond 1.5 times the middle half's width.
 
     Args:

@@ -274,6 +274,7 @@ def _scatter(axes: Axes, points: Sequence[tuple[Array, Any]]) -> None:
     for point, look in points:
         inside = [float(np.clip(v, *ends)) for v, ends in zip(point, limits, strict=True)]
         axes.plot(*inside, **point_of(look))
-    for (low, high), set_limits in zip(limits, (axes.set_xlim, axes.set_ylim), strict=True):
-        room = 0.06 * (high - low) or 1.0
-        set_limits(low - room, high + room)
+    (left, right), (low, high) = limits
+    across, up = 0.06 * (right - left) or 1.0, 0.06 * (high - low) or 1.0
+    axes.set_xlim(left - across, right + across)
+    axes.set_ylim(low - up, high + up)

@@ -117,7 +117,7 @@ def bands(found: Verdicts, out_dir: Path, name: str) -> str | None:
         axes.set_ylim(len(ranked) - 0.4, -0.6)
         axes.set_xlim(0.5, len(ranked) + 0.5)
         axes.set_xlabel("rank by mean gain, 1 is best")
-        shown = {"color": GRAY, "solid_capstyle": "butt"}
+        shown: dict[str, Any] = {"color": GRAY, "solid_capstyle": "butt"}
         choices = "definition, problem left out" if len(found.problems) > 1 else "definition"
         more = [
             Line2D([], [], linewidth=7, alpha=0.3, label="seeds, 95 %", **shown),
