@@ -25,6 +25,7 @@ import traceback
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,6 +61,7 @@ GIVEN = (  # the harness fills these arguments in
     *("self", "terms", "seed", "strides", "size", "outputs", "pretrained"),
 )
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders are called by it
+ANY = "[!_.]*"  # matches the stems of plug-ins, and not those of what lies beside them
 NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
 IS_NAME = Rule(
     "a name of a-z, 0-9 and _",
@@ -123,7 +125,8 @@ def path_of(kind: str, name: str) -> Path:
         ValueError: an unknown name, one that two files have, or what is no name.
     """
     name = stem_and_field(name)[0]
-    word, paths = kind[:-1], _candidates(kind).get(name)
+    word = kind[:-1]
+    paths = _candidates(kind, name if NAME.fullmatch(name) else ANY).get(name)
     if paths is None:
         raise ValueError(
             f"no {word} called '{name}'{did_you_mean(name, files(kind))}; "
@@ -141,11 +144,12 @@ def kinds_of(name: str) -> list[str]:
     return [kind for kind in KINDS if name in _candidates(kind)]
 
 
-def _candidates(kind: str) -> dict[str, list[Path]]:
+def _candidates(kind: str, name: str = ANY) -> dict[str, list[Path]]:
+    """Files by name: of one name, whose other files need not be read, or of any."""
     found: dict[str, list[Path]] = {}
-    paths = [path for folder in folders(kind) for path in _files_in(folder)]
+    paths = [path for folder in folders(kind) for path in _files_in(folder, name)]
     extra = (Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep))
-    paths += [path for path in extra if path.is_file()]
+    paths += [path for path in extra if path.is_file() and fnmatchcase(name_of(path), name)]
     for path in dict.fromkeys(path.resolve() if path.is_file() else path for path in paths):
         if _kind_of(path) == kind:
             found.setdefault(name_of(path), []).append(path)
@@ -164,8 +168,8 @@ def stem_and_field(task: str) -> tuple[str, str]:
     return stem, field
 
 
-def _files_in(folder: Path) -> list[Path]:
-    return sorted([*folder.glob("[!_.]*.py"), *folder.glob("[!_.]*/__init__.py")])
+def _files_in(folder: Path, name: str) -> list[Path]:
+    return sorted([*folder.glob(f"{name}.py"), *folder.glob(f"{name}/__init__.py")])
 
 
 def name_of(path: Path) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 from mtl_bench.core.files import replacing
-from mtl_bench.core.locks import Quiet
+from mtl_bench.core.locks import STEP_S, Quiet
 from mtl_bench.core.provenance import cores
 
 WINDOW = 20  # steps whose median is their pace
@@ -29,7 +29,7 @@ class Progress:
         self._path = run_dir / "progress.json"
         self._every_s = every_s
         self._echo = echo
-        self._last = 0.0
+        self._last = self._passed = 0.0
         self._start = time.monotonic()
         self.quiet = Quiet(run_dir.parent)
         self.stop_asked = False
@@ -48,8 +48,10 @@ class Progress:
 
     def update(self, stage: str, step: int, steps: int, note: str = "") -> None:
         """After every step of a stage; waits here while another cell is timed."""
-        self.quiet.pass_by()
         now = time.monotonic()
+        if now - self._passed >= STEP_S / 4:  # the lock takes longer than a small step's losses
+            self.quiet.pass_by()
+            now = self._passed = time.monotonic()
         if now - self._last < self._every_s and step < steps:
             return
         self._last = now
