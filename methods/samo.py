@@ -1,10 +1,13 @@
 """SAMO: each gradient is taken where its own loss and the mean loss rise, for flat minima.
 
 Source: Ban, Subramani, Ji, SAMO: A Lightweight Sharpness-Aware Approach for Multi-Task Optimization
-with Joint Global-Local Perturbation, ICCV 2025, arXiv:2507.07883. Put it before a method that
-weighs gradients: `samo+mgda`; alone it is around the plain sum. A loss's own slope is estimated by
-two forward passes along a random direction and scaled to the mean gradient's length, tensor by
-tensor, so that of its size only the sign counts.
+with Joint Global-Local Perturbation, ICCV 2025, arXiv:2507.07883. Written from notes about the
+paper and reviews of it, not from its text, and held against no published number. Put it before a
+method that weighs gradients: `samo+mgda`; alone it is around the plain sum. A loss's own slope is
+estimated by two forward passes along a random direction and scaled to the mean gradient's length,
+tensor by tensor, so that of its size only the sign counts. Departures that are known: whatever the
+notes left open, such as the scaling by tensors, one draw a loss, and heads trained at the unmoved
+parameters' losses, is this file's reading.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,9 +46,6 @@ class SAMO(PerturbedMethod):
         if rho < 0 or not 0 <= alpha <= 1 or mu <= 0:
             raise ValueError(f"rho {rho}, alpha {alpha}, mu {mu}: >= 0, in 0 to 1, above 0")
         self.rho, self.alpha, self.mu = rho, alpha, mu
-
-    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
-        return self.inner.weights(G_KK, step)
 
     def shifts(
         self,

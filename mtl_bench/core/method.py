@@ -155,6 +155,8 @@ class LookAheadMethod(GradientMethod):
 class Wrapper(GradientMethod):
     """A gradient method around another: in `a+b`, what `a` makes of the weights of `b`.
 
+    Unless it says otherwise, nothing.
+
     Args:
         inner: what it is around where nothing is said.
     """
@@ -174,6 +176,9 @@ class Wrapper(GradientMethod):
             raise ValueError(f"{name} goes around methods that weigh one batch, not {other}")
         self.inner, self.needs, self.weighted_heads = inner, inner.needs, inner.weighted_heads
         return self
+
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        return self.inner.weights(G_KK, step)
 
     def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
         return self.inner.head_weights(weight_K, step)
