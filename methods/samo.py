@@ -5,9 +5,8 @@ with Joint Global-Local Perturbation, ICCV 2025, arXiv:2507.07883. Written from 
 paper and reviews of it, not from its text, and held against no published number. Put it before a
 method that weighs gradients: `samo+mgda`; alone it is around the plain sum. A loss's own slope is
 estimated by two forward passes along a random direction and scaled to the mean gradient's length,
-tensor by tensor, so that of its size only the sign counts. Departures that are known: whatever the
-notes left open, such as the scaling by tensors, one draw a loss, and heads trained at the unmoved
-parameters' losses, is this file's reading.
+tensor by tensor, so that of its size only the sign counts. Departures: what the notes
+leave open, such as a draw for each loss, is this file's reading.
 """
 
 from collections.abc import Callable, Sequence

@@ -20,7 +20,7 @@ from pathlib import Path
 from mtl_bench.core.locks import LAUNCHER
 
 PROGRAM = (sys.executable, "-m", "mtl_bench")
-MODULES = ("mtl_bench.cli.app", "mtl_bench.bench.run", "mtl_bench.bench.fingerprinted")
+MODULES = ("mtl_bench.cli.app", "mtl_bench.bench.run", "mtl_bench.bench.warmed")
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
