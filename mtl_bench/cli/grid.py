@@ -1,7 +1,8 @@
 """`ablate`, `status` and `report`: a grid of cells or of timings."""
 
+import itertools
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -99,30 +100,35 @@ def ablate(
 
         of_cells.check(chosen)
     given = Data(None if data is None else data.resolve())
-    todo = store.to_run([*chosen.jobs, *against], runs, rerun, given)
-    for job in [] if dry_run else todo:
+    phases = _phases(chosen, runs, rerun is not None, given)
+    first = _left(next(phases), runs, rerun, given)
+    for job in [] if dry_run else first:
         if isinstance(job, Cell):
             o.locate(job, data)  # a wrong folder is told at once
     if not quiet or dry_run:
-        _announce(chosen, todo, runs, given)
+        _announce(chosen, first, runs, rerun, given)
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
         return
-    if todo:
-        jobs = jobs or _side_by_side(chosen, todo, device)
-        _run(chosen, todo, runs, data, given, ["--wandb", wandb.value], device, jobs, rerun, quiet)
+    ran = False
+    options = ["--wandb", wandb.value]
+    for todo in itertools.chain([first], (_left(each, runs, rerun, given) for each in phases)):
+        ran = ran or bool(todo)
+        if todo:
+            several = jobs or _side_by_side(chosen, todo, device)
+            _run(chosen, todo, runs, data, given, options, device, several, rerun, quiet)
     if chosen.kind is CELLS:
         references.measure_trivial(
-            chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=bool(todo)
+            chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=ran
         )
     rows = _rows(chosen, runs, given)
     page = _write(chosen, rows, runs, reports, choice.command)
     words = [row["status"] for row in rows]
-    behind = [store.status(cell, runs, given) for cell in against]
-    bad = any(word not in chosen.kind.good for word in [*words, *behind])
+    words += [] if chosen.tune else [store.status(cell, runs, given) for cell in against]
+    bad = any(word not in chosen.kind.good for word in words)
     if bad or not quiet:
-        done = sum(word in ("done", "stale") for word in words)
-        typer.echo(f"{done} of {len(words)} {chosen.kind.noun}s done; report: {page}")
+        done = sum(row["status"] in ("done", "stale") for row in rows)
+        typer.echo(f"{done} of {len(rows)} {chosen.kind.noun}s done; report: {page}")
     if bad:
         raise typer.Exit(1)
 
@@ -141,26 +147,29 @@ def status(
 
     Those that are in no row of the grid but needed by one are marked as such.
     """
-    from mtl_bench.bench import references, store
+    from mtl_bench.bench import store
     from mtl_bench.bench.jobs import TIMINGS, with_parents
     from mtl_bench.core.locks import claimed_by
 
     chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
-    own = {job.id for job in chosen.jobs}
-    every = with_parents([*chosen.jobs, *references.baselines(chosen)])
+    own, names = _named(chosen, runs)
+    every = with_parents(own)
+    known = {job.id for job in own} if chosen.tune else {job.id for job in chosen.jobs}
     lines = []
     for job in every:
         state = store.inspect(job, runs)
         about = "  ".join(filter(None, (state.why, state.headline)))
         if isinstance(job, Cell):
-            name = chosen.names.get(job.id, "") if job.id in own else "(needed by another)"
-            named = [name] if chosen.names or len(every) > len(own) else []
+            name = names.get(job.id, "") if job.id in known else "(needed by another)"
+            named = [name] if names or len(every) > len(known) else []
             what = [*named, job.label, str(store.run_dir(job, runs))]
         else:
             what = [*job.words, job.id]
         lines.append([state.word, *what, about])
     for line in [*o.columns(lines), *_skipped(chosen), store.summary(chosen.kind, every, runs)]:
         typer.echo(line)
+    if chosen.tune:
+        _tell_parts(chosen, runs)
     owner = claimed_by(runs / "latency") if chosen.kind is TIMINGS else None
     if owner is not None:
         typer.echo(f"process {owner.get('pid', '?')} is timing now")
@@ -272,30 +281,104 @@ class Choice:
         return shlex.join(words)
 
 
-def _announce(grid: "Grid", todo: "Sequence[Job]", runs: Path, data: "Data") -> None:
-    from mtl_bench.bench import references, store
+def _phases(grid: "Grid", runs: Path, again: bool, data: "Data") -> "Iterator[Sequence[Job]]":
+    """What is run one after another: of a grid that is tuned, problem by problem, trials and then
+    the results that they choose.
+
+    Args:
+        again: trials that failed, too.
+    """
+    from mtl_bench.bench import references, tuning
+
+    if grid.tune is None:
+        yield [*grid.jobs, *references.baselines(grid)]
+        return
+    for problem in tuning.problems(grid):
+        yield tuning.part(grid, problem, runs, data).to_try(again)
+        yield [final.cell for final in tuning.finals(grid, runs, data, [problem])]
+
+
+def _left(jobs: "Sequence[Job]", runs: Path, rerun: str | None, data: "Data") -> "list[Job]":
+    from mtl_bench.bench import store
+
+    return store.to_run(jobs, runs, rerun, data)
+
+
+def _named(grid: "Grid", runs: Path) -> "tuple[list[Job], Mapping[str, str]]":
+    """The jobs that are known by now, and what a reader calls them."""
+    from mtl_bench.bench import references, tuning
+
+    if grid.tune is None:
+        return [*grid.jobs, *references.baselines(grid)], grid.names
+    found: dict[str, tuple[Job, str]] = {}
+    for trial in tuning.trials(grid):
+        name = f"{trial.line} on {trial.problem}, trial {trial.number}"
+        found.setdefault(trial.cell.id, (trial.cell, name))
+    for final in tuning.finals(grid, runs):
+        name = f"{final.line} on {final.problem}, trial {final.choice.trial.number} chosen"
+        found.setdefault(final.cell.id, (final.cell, name))
+    return [job for job, _ in found.values()], {id: name for id, (_, name) in found.items()}
+
+
+def _tell_parts(
+    grid: "Grid", runs: Path, rerun: str | None = None, data: "Data | None" = None
+) -> None:
+    """A line for each problem: how far its trials and results are, and the hours left."""
+    from mtl_bench.bench import store, tuning
+
+    for problem in tuning.problems(grid):
+        part = tuning.part(grid, problem, runs, data)
+        wanted = [*part.to_try(rerun is not None), *(each.cell for each in part.finals)]
+        todo = store.to_run(wanted, runs, rerun, data)
+        trials = store.summary(grid.kind, [each.trial.cell for each in part.trials], runs, data)
+        words = [f"  {problem}: trials: {trials}"]
+        finals = store.summary(grid.kind, [each.cell for each in part.finals], runs, data)
+        waiting = f"{len(part.open)} after their trials" if part.open else ""
+        words += ["results: " + "   ".join(filter(None, (finals, waiting)))]
+        hours = part.hours(todo, runs) if todo or part.open else 0.0
+        words += [
+            "hours left: not known, none is done"
+            if hours is None
+            else f"about {hours:.1f} hours left, one after another"
+        ]
+        typer.echo("; ".join(words))
+
+
+def _announce(
+    grid: "Grid", todo: "Sequence[Job]", runs: Path, rerun: str | None, data: "Data"
+) -> None:
+    from mtl_bench.bench import references, store, tuning
     from mtl_bench.bench.jobs import CELLS, with_parents
 
-    every = with_parents([*grid.jobs, *references.baselines(grid)])
     counts = {axis: len(values) for axis, values in grid.axes.items()}
     counts |= {"row": len(set(grid.names.values()))} if grid.names else {}
     product = " x ".join(f"{n} {a}{'s' * (n > 1 and a[-1] != 's')}" for a, n in counts.items())
+    typer.echo(f"{grid.name}: {grid.question}")
     if grid.kind is CELLS:
-        needed = len(every) - len(grid.jobs)
-        more = f" and {needed} that they need" if needed else ""
         about = " or ".join(dict.fromkeys(_told(job.recipe) for job in grid.jobs))
     else:
         first = grid.jobs[0]
-        more = f" of {first.passes} passes on {first.device}"
         about = f"network of recipe {first.recipe}"
-    typer.echo(f"{grid.name}: {grid.question}")
-    typer.echo(
-        f"{len(grid.jobs)} {grid.kind.noun}s{more} = {product}, less {len(grid.skips)} skipped; "
-        f"{about}"
-    )
-    hours = store.hours_to_run(todo, every, runs)
-    about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
-    typer.echo(f"  {store.summary(grid.kind, every, runs, data)}   to run {len(todo)}{about}")
+    if grid.tune is not None:
+        typer.echo(
+            f"{len(grid.jobs)} results = {product}, less {len(grid.skips)} skipped, and their "
+            f"baselines; before them {len(tuning.trials(grid))} trials: {grid.tune.trials} of "
+            f"every line on every problem, judged on the split {tuning.SPLIT}; {about}"
+        )
+        _tell_parts(grid, runs, rerun, data)
+    else:
+        every = with_parents([*grid.jobs, *references.baselines(grid)])
+        needed = len(every) - len(grid.jobs)
+        more = f" and {needed} that they need" if needed else ""
+        more = more if grid.kind is CELLS else f" of {first.passes} passes on {first.device}"
+        typer.echo(
+            f"{len(grid.jobs)} {grid.kind.noun}s{more} = {product}, less {len(grid.skips)} "
+            f"skipped; {about}"
+        )
+        hours = store.hours_to_run(todo, every, runs)
+        about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
+        done = store.summary(grid.kind, every, runs, data)
+        typer.echo(f"  {done}   to run {len(todo)}{about}")
     for line in _skipped(grid):
         typer.echo(line)
 
@@ -356,22 +439,26 @@ def _run(
 
     command = of_cell if grid.kind is kinds.CELLS else of_timing
     bars = grid.kind is kinds.CELLS  # which would draw while something is timed
+    names = _named(grid, runs)[1]
     with display.choose(len(todo), quiet, bars) as shown:
-        launcher = Launcher(
-            runs, command, shown, jobs, rerun, grid.names, smoke=grid.smoke, data=given
-        )
+        launcher = Launcher(runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given)
         launcher.run(todo)
 
 
 def _rows(grid: "Grid", runs: Path, data: "Data | None" = None) -> list[dict[str, Any]]:
     """One row a job; of cells with their deltas to the stored row of their baseline."""
-    from mtl_bench.bench import references, store
+    from mtl_bench.bench import references, store, tuning
 
-    rows = store.rows(grid.jobs, runs, grid.names, data)
+    if grid.tune is None:
+        rows = store.rows(grid.jobs, runs, grid.names, data)
+    else:
+        rows, against = tuning.results(grid, runs, data)
     if not grid.baseline:
         return rows
     from mtl_bench.report.delta import with_delta
 
+    if grid.tune is not None:
+        return with_delta(rows, lambda row: against.get(row["cell_id"]))
     return with_delta(rows, lambda row: references.baseline_row(grid, row, runs))
 
 

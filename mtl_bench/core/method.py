@@ -23,7 +23,7 @@ always K = T), P shared parameters, flattened.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -53,7 +53,9 @@ class Method(nn.Module):
     needs: Needs
     batches = 1  # independent batches a step
     reevaluates = False  # True: `after_step` gets the batch's losses under the new parameters
-    space: Mapping[str, Any] = MappingProxyType({})  # hyper-parameters to tune, and their values
+    # Hyper-parameters that a grid's trials tune, and where their values lie: see bench/space.py
+    space: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"tune": ("space",)}
     fixed_T: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0):

@@ -18,7 +18,7 @@ from mtl_bench.core.config import to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
 from mtl_bench.core.style import MANY
 from mtl_bench.report import columns as known
-from mtl_bench.report import curves, pictures, plots, protocol
+from mtl_bench.report import curves, pictures, plots, protocol, tuned
 from mtl_bench.report.columns import DELTA, ONLY, RELATIVE, Row, headlines, pairs, per_class, text
 from mtl_bench.report.delta import counted
 from mtl_bench.report.page import PAGE, Page, beside, figures_of, render
@@ -467,6 +467,12 @@ def _write(
     elif (control := Layout.of(grid.report).control) is not None:
         lines = [", ".join(group.identity) for group in results.groups]
         table = replace(table, notes=(*table.notes, untested(control, lines)))
+    if (tune := getattr(grid, "tune", None)) is not None:
+        table = replace(
+            table,
+            sections=(*table.sections, tuned.section(rows, tune)),
+            notes=(*table.notes, tuned.note(tune)),
+        )
     page = Page(
         kind="grid",
         title=f"{grid.name}: mtl-bench report",
