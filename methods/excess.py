@@ -29,6 +29,7 @@ class ExcessMTL(GradientMethod):
 
     needs = "jacobian"
     weighted_heads = True
+    replayable = True
     log_weight_T: Tensor  # logarithms, from which a weight can return after it was 0
     base_T: Tensor  # e(0)
     count_T: Tensor

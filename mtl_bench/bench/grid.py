@@ -43,9 +43,10 @@ rows say one, or with settings of its own:
     suite = ["a", "b", { recipe = "c", backbone = "d", "recipe.data.val_scenes" = 200 }]
 
 `method` and `backbone` stand in the axes or in every row; a file without [[row]] is the axes alone.
-Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, recipe,
-recipe.SECTION.KEY, method.KEY, backbone.KEY. Under [baseline] a cell keeps recipe, backbone and
-seed, and nothing else of its own. A wrong key is told with its line.
+Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, replay,
+recipe, recipe.SECTION.KEY, method.KEY, backbone.KEY. Under [baseline] a cell keeps recipe, backbone
+and seed, and nothing else of its own. A wrong key is told with its line. `replay` trains a row with
+the weights that its method logged, whose own run need not be in the grid: see train/replay.py.
 
 A grid of timings says which networks to time, at which sizes, on which engines:
 
@@ -174,6 +175,7 @@ def baseline_cell(cell: Cell, settings: Values) -> Cell:
     plain = replace(
         cell,
         tasks=cell.recipe.tasks,
+        replay=None,
         video=False,
         single_task=False,
         granularity="terms",

@@ -266,6 +266,8 @@ class Cells(Kind[Cell]):
             values["pretrained"] = Path(job.pretrained).name
         if job.continues is not None:
             values["continues"] = job.continues.slug
+        if job.replay is None:
+            del values["replay"]
         keys = ("method", "backbone", "tasks", "seed", "video", "single_task", "granularity")
         return {
             "cell_id": job.id,

@@ -220,6 +220,27 @@ def lineage(kind: str, path: Path) -> list[ast.ClassDef]:
     return next((list(line.values()) for line in lines if contract in [*line][1:]), [])
 
 
+def declared(kind: str, name: str) -> dict[str, object]:
+    """As `declared_in`, of a plug-in by its name; also what its bases declare, without importing.
+
+    Raises:
+        ValueError: an unknown or ambiguous name, or a file that is no Python.
+    """
+    return declared_in(lineage(kind, path_of(kind, name)))
+
+
+def declared_in(line: Sequence[ast.ClassDef]) -> dict[str, object]:
+    """Class attributes with a constant value; the nearest class counts."""
+    values: dict[str, object] = {}
+    for node in reversed(line):
+        for item in node.body:
+            if isinstance(item, ast.Assign) and isinstance(item.value, ast.Constant):
+                values |= {ast.unparse(target): item.value.value for target in item.targets}
+            elif isinstance(item, ast.AnnAssign) and isinstance(item.value, ast.Constant):
+                values[ast.unparse(item.target)] = item.value.value
+    return values
+
+
 @functools.cache
 def _parse(text: bytes) -> ast.Module:
     return ast.parse(text)

@@ -26,7 +26,7 @@ NOT_NUMBERS = (  # keys of a cell that change no number
 )
 KNOWN = (  # axes in the order in which they stand
     *("method", "backbone", "tasks", "single_task", "video", "granularity"),
-    *("pretrained", "recipe.name"),
+    *("replay", "pretrained", "recipe.name"),
 )
 SHOWN = ("done", "stale")  # statuses that have numbers
 
