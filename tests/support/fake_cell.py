@@ -13,8 +13,13 @@ import time
 from pathlib import Path
 
 from mtl_bench.bench import store
+from mtl_bench.core import locks
 from mtl_bench.core.files import write_json
 from mtl_bench.core.locks import CLAIMED, ClaimedError, claim
+
+if "TEST_LEASE_S" in os.environ:
+    locks.LEASE_S = float(os.environ["TEST_LEASE_S"])
+    locks.BEAT_S = locks.LEASE_S / 8
 
 
 def note(directory: Path, word: str) -> None:
