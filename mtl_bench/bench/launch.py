@@ -67,6 +67,7 @@ class Run(ABC):
     began: float = field(default_factory=time.monotonic)
     progress: Mapping[str, Any] = field(default_factory=dict)  # of its `progress.json`
     process: "subprocess.Popen[bytes] | Forked | None" = None
+    gpu: str | None = None  # that it has, as CUDA_VISIBLE_DEVICES names it
     _stage: tuple[str, int, float] = ("", 0, 0.0)  # name, first step seen, when
 
     @property
@@ -240,6 +241,8 @@ class Launcher:
         lack: why a timing cannot be taken on this machine; then no process is started for it.
         smoke: stands in the rows of timings.
         data: those that cells run on.
+        gpus: that cells are spread over, see `gpu_pool`: one each, and several on one only where
+            there are more `jobs`. None: the processes see what this one sees.
     """
 
     runs: Path
@@ -251,6 +254,7 @@ class Launcher:
     lack: Callable[[Timing], str | None] = lack_of
     smoke: bool = False
     data: Data | None = None
+    gpus: Sequence[str] = ()
     _running: list[Run] = field(default_factory=list)
     _unsettled: set[str] = field(default_factory=set)  # ids whose jobs have not ended here yet
     _elsewhere: set[str] = field(default_factory=set)  # ids that another process was seen running
@@ -342,8 +346,11 @@ class Launcher:
             self._end(run, settled)
             return
         command = run.prepare(state, self.rerun)
+        if self.gpus:
+            taken = [each.gpu for each in self._running]
+            run.gpu = min(self.gpus, key=taken.count)
         self._running.append(run)
-        environment = child_environment(self.jobs)
+        environment = child_environment(self.jobs, run.gpu)
         if isinstance(run, CellRun) and can_fork(command):
             run.process = Forked(command[len(PROGRAM) :], run.log, environment)
         else:
@@ -408,13 +415,26 @@ class Launcher:
             run.release()
 
 
-def child_environment(jobs: int) -> dict[str, str]:
+def gpu_pool(visible: str | None, count: int) -> tuple[str, ...]:
+    """The GPUs that this process sees, as CUDA_VISIBLE_DEVICES would name each.
+
+    Args:
+        visible: CUDA_VISIBLE_DEVICES; None: not set, and all are seen.
+        count: how many are seen. CUDA ends at the first name that it does not know.
+    """
+    names = map(str, range(count)) if visible is None else map(str.strip, visible.split(","))
+    return tuple(names)[:count]
+
+
+def child_environment(jobs: int, gpu: str | None = None) -> dict[str, str]:
     """Of a job's process; processes side by side share the cores instead of fighting for them."""
     extra = {locks.LAUNCHER: json.dumps(locks.process()), ORDERED: "1"}
     extra |= {"PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if jobs > 1:
         extra["OMP_NUM_THREADS"] = str(max(1, cores() // jobs))
         extra[locks.SIDE_BY_SIDE] = str(jobs)
+    if gpu is not None:
+        extra["CUDA_VISIBLE_DEVICES"] = gpu
     return {**os.environ, **extra}
 
 

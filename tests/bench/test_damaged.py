@@ -231,6 +231,19 @@ def saved(tmp_path):
     return cell, tmp_path / "last.pt"
 
 
+def test_one_that_saw_more_gpus_is_continued_on_fewer(saved, monkeypatch):
+    cell, path = saved
+    state = torch.load(path)
+    state["rng_cuda"] = [torch.tensor([n], dtype=torch.uint8) for n in range(3)]
+    torch.save(state, path)
+    assert checkpoint.restore(path, cell, *parts()) == 7
+    found = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda drawn, gpu: found.append((gpu, drawn)))
+    checkpoint.restore(path, cell, *parts())
+    assert found == [(0, torch.tensor([0], dtype=torch.uint8))]
+
+
 def test_a_checkpoint_of_another_cell_is_not_continued(saved):
     cell, path = saved
     assert checkpoint.restore(path, cell, *parts()) == 7

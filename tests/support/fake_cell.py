@@ -25,7 +25,8 @@ if "TEST_LEASE_S" in os.environ:
 def note(directory: Path, word: str) -> None:
     threads = os.environ.get("OMP_NUM_THREADS", "-")
     with (directory.parent / "history.txt").open("a") as file:
-        file.write(f"{word} {directory.name} {time.time()} {threads} {os.getpid()}\n")
+        gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "-")
+        file.write(f"{word} {directory.name} {time.time()} {threads} {os.getpid()} {gpu}\n")
 
 
 def interrupt(number, frame):
