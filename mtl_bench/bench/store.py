@@ -22,6 +22,7 @@ runs/latency/                             of timings
 
 import shutil
 import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,12 +33,14 @@ from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_pa
 from mtl_bench.core import provenance
 from mtl_bench.core.config import Cell
 from mtl_bench.core.files import read_json, write_json
-from mtl_bench.core.locks import claimed_by
+from mtl_bench.core.locks import claimed_by, is_here
 from mtl_bench.core.plain import to_dict
 
 SECTIONS = ("metric", "protocol", "time", "code", "data", "env", "cell", "timing")  # of a row
 TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
 ASIDE = "set-aside-"
+ELSEWHERE = "on another machine"
+SHOWN_S = 60.0  # for a file that another machine has written to be seen on a shared folder
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
 
 
@@ -106,9 +109,23 @@ def inspect(job: Job, runs: Path, data: Data | None = None) -> State:
     Args:
         data: those that it would run on; a row of others is stale. None: not known.
     """
-    if claimed_by(run_dir(job, runs)) is not None:
-        return State("running")
+    if (owner := claimed_by(run_dir(job, runs))) is not None:
+        return State("running", "" if not owner or is_here(owner) else ELSEWHERE)
     return stored(job, runs, data)
+
+
+def inspect_done(job: Job, runs: Path, data: Data | None = None) -> State:
+    """As `inspect`, of a job that is known to be done: what a shared folder's cache does not show
+    yet is waited for."""
+    deadline = time.monotonic() + SHOWN_S
+    state = inspect(job, runs, data)
+    while state.word in ("missing", "interrupted", "running") and time.monotonic() < deadline:
+        time.sleep(0.5)
+        for folder in (runs, run_dir(job, runs)):
+            if folder.is_dir():
+                list(folder.iterdir())  # reading a folder asks the server what is in it
+        state = inspect(job, runs, data)
+    return state
 
 
 def stored(job: Job, runs: Path, data: Data | None = None) -> State:

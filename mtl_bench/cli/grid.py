@@ -1,6 +1,7 @@
 """`ablate`, `status` and `report`: a grid of cells or of timings."""
 
 import itertools
+import os
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,8 +55,8 @@ def ablate(
             "--jobs",
             metavar="N",
             min=1,
-            help="Cells at a time; they share the cores. Without it as many as there are cores, on "
-            "a GPU one.",
+            help="Cells at a time; they share the cores, and the GPUs that CUDA_VISIBLE_DEVICES "
+            "names. Without it one a GPU, or else one a core.",
             show_default=False,
         ),
     ] = None,
@@ -111,12 +112,13 @@ def ablate(
         typer.echo("nothing was run (--dry-run)")
         return
     ran = False
+    gpus = _gpus(chosen, device)
     options = ["--wandb", wandb.value]
     for todo in itertools.chain([first], (_left(each, runs, rerun, given) for each in phases)):
         ran = ran or bool(todo)
         if todo:
-            several = jobs or _side_by_side(chosen, todo, device)
-            _run(chosen, todo, runs, data, given, options, device, several, rerun, quiet)
+            several = jobs or _side_by_side(chosen, todo, gpus)
+            _run(chosen, todo, runs, data, given, options, device, several, gpus, rerun, quiet)
     if chosen.kind is CELLS:
         references.measure_trivial(
             chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=ran
@@ -399,15 +401,29 @@ def _skipped(grid: "Grid") -> list[str]:
     return [f"  skipped {reasons.count(why)}: {why}" for why in dict.fromkeys(reasons)]
 
 
-def _side_by_side(grid: "Grid", todo: "Sequence[Job]", device: o.Device) -> int:
-    """A cell a core on the CPU, where two processes of one thread do more steps than one of two."""
-    from mtl_bench.bench.jobs import CELLS, kind_of
+def _gpus(grid: "Grid", device: o.Device) -> tuple[str, ...]:
+    """What cells are spread over; a timing takes the GPU that it would take in a terminal."""
+    from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.bench.launch import gpu_pool
     from mtl_bench.core.device import choose_device
+
+    if grid.kind is not CELLS or choose_device(device.value).type != "cuda":
+        return ()
+    import torch
+
+    return gpu_pool(os.environ.get("CUDA_VISIBLE_DEVICES"), torch.cuda.device_count())
+
+
+def _side_by_side(grid: "Grid", todo: "Sequence[Job]", gpus: Sequence[str]) -> int:
+    """A cell a GPU. Without one a cell a core: two processes of one thread do more steps than one
+    of two."""
+    from mtl_bench.bench.jobs import CELLS, kind_of
     from mtl_bench.core.provenance import cores
 
-    if grid.kind is not CELLS or choose_device(device.value).type != "cpu":
+    if grid.kind is not CELLS:
         return 1
-    return min(cores(), sum(kind_of(job).work(job) > 0 for job in todo) or 1)
+    trained = sum(kind_of(job).work(job) > 0 for job in todo) or 1
+    return min(len(gpus) or cores(), trained)
 
 
 def _run(
@@ -419,6 +435,7 @@ def _run(
     options: list[str],
     device: o.Device,
     jobs: int,
+    gpus: Sequence[str],
     rerun: str | None,
     quiet: bool,
 ) -> None:
@@ -441,7 +458,9 @@ def _run(
     bars = grid.kind is kinds.CELLS  # which would draw while something is timed
     names = _named(grid, runs)[1]
     with display.choose(len(todo), quiet, bars) as shown:
-        launcher = Launcher(runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given)
+        launcher = Launcher(
+            runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given, gpus=gpus
+        )
         launcher.run(todo)
 
 

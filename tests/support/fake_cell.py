@@ -13,14 +13,20 @@ import time
 from pathlib import Path
 
 from mtl_bench.bench import store
+from mtl_bench.core import locks
 from mtl_bench.core.files import write_json
 from mtl_bench.core.locks import CLAIMED, ClaimedError, claim
+
+if "TEST_LEASE_S" in os.environ:
+    locks.LEASE_S = float(os.environ["TEST_LEASE_S"])
+    locks.BEAT_S = locks.LEASE_S / 8
 
 
 def note(directory: Path, word: str) -> None:
     threads = os.environ.get("OMP_NUM_THREADS", "-")
     with (directory.parent / "history.txt").open("a") as file:
-        file.write(f"{word} {directory.name} {time.time()} {threads} {os.getpid()}\n")
+        gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "-")
+        file.write(f"{word} {directory.name} {time.time()} {threads} {os.getpid()} {gpu}\n")
 
 
 def interrupt(number, frame):
