@@ -95,8 +95,8 @@ class Bench:
             torch.cuda.synchronize()
 
 
-def open_bench(granularity: str, device: torch.device) -> Bench:
-    recipe = load_recipe("small")
+def open_bench(granularity: str, device: torch.device, name: str = "small") -> Bench:
+    recipe = load_recipe(name)
     data = replace(recipe.data, train_scenes=16, val_scenes=4, frames=3)
     cell = Cell(replace(recipe, data=data), "resnet18", BASE, granularity=granularity)
     model, method, _ = build(cell, Compute(device))
