@@ -201,18 +201,21 @@ def main() -> None:
     parser.add_argument(
         "--tasks", type=int, help="in place of `small` the network cnn9 with so many attributes"
     )
+    parser.add_argument("--recipe", default="small", help="smoke: only shows that it runs")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument(
         "--rounds", type=int, default=15, help="four times as many for loss-value methods"
     )
     parser.add_argument("--quick", action="store_true", help="two rounds: only shows that it runs")
     given = parser.parse_args()
-    bench = open_bench(given.granularity, choose_device(given.device), given.tasks)
+    device = choose_device(given.device)
+    bench = open_bench(given.granularity, device, given.tasks, given.recipe)
     costs = {card.about.name: card.cost for card in cards.cards()}
     names = [plugins.path_of("methods", name).stem for name in given.names] or list(costs)
     rounds = 2 if given.quick else given.rounds
     loss_only = [name for name in names if "K" not in costs[name]]
-    setting = fastest_setting(bench, rounds) if aggregation is not None else None
+    twins = {*AGGREGATORS, *TWO_BATCH_WEIGHTINGS}.intersection(names)
+    setting = fastest_setting(bench, rounds) if twins and aggregation is not None else None
     results = list(measure(bench, loss_only, rounds if given.quick else 4 * rounds, None))
     rest = [name for name in names if name not in loss_only]
     results += measure(bench, rest, rounds, setting)
@@ -222,7 +225,7 @@ def main() -> None:
     print(
         f"torch {torch.__version__} on {where}, {torch.get_num_threads()} threads; "
         f"K = {len(bench.terms)} ({given.granularity}); {rounds} rounds, "
-        f"{len(results[0].ours_s)} of loss-value methods; torchjd: {setting or 'not installed'}.\n"
+        f"{len(results[0].ours_s)} of loss-value methods; torchjd: {setting or 'not run'}.\n"
     )
     print(table(results, costs, peak_mib(bench, partial(our_step, bench, BASE))))
     print("\n" + "\n".join([f"{cards.LEGEND}", *verdicts(results, costs)]))

@@ -96,13 +96,17 @@ class Bench:
             torch.cuda.synchronize()
 
 
-def open_bench(granularity: str, device: torch.device, tasks: int | None = None) -> Bench:
-    """Args: tasks: so many attributes of random images in place of `small`'s two tasks."""
-    return many_tasks(tasks, device) if tasks else two_tasks(granularity, device)
+def open_bench(
+    granularity: str, device: torch.device, tasks: int | None = None, recipe: str = "small"
+) -> Bench:
+    """Args:
+    tasks: so many attributes of random images in place of the recipe's two tasks.
+    """
+    return two_tasks(granularity, device, recipe) if tasks is None else many_tasks(tasks, device)
 
 
-def two_tasks(granularity: str, device: torch.device) -> Bench:
-    recipe = load_recipe("small")
+def two_tasks(granularity: str, device: torch.device, name: str) -> Bench:
+    recipe = load_recipe(name)
     data = replace(recipe.data, train_scenes=16, val_scenes=4, frames=3)
     cell = Cell(replace(recipe, data=data), "resnet18", BASE, granularity=granularity)
     model, method, _ = build(cell, Compute(device))
