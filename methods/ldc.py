@@ -30,6 +30,8 @@ class LossDiscrepancyControl(LossMethod):
         normalize: "start" (l as above) or "none" (l = L).
     """
 
+    space = {"lam": {"log": [0.01, 0.1]}}
+
     start_T: Tensor  # L_i(0); 0: not seen yet
 
     def __init__(

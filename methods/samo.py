@@ -33,6 +33,8 @@ class SAMO(PerturbedMethod):
         mu: step of the estimate; 0.01 in the paper.
     """
 
+    space = {"rho": {"log": [0.01, 0.5]}, "alpha": {"uniform": [0.3, 0.7]}}
+
     def __init__(
         self,
         terms: Sequence[Term],

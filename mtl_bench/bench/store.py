@@ -30,7 +30,7 @@ from typing import Any
 
 from mtl_bench.bench.data_state import STAGES, Data
 from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_parents
-from mtl_bench.core import provenance
+from mtl_bench.core import plugins, provenance
 from mtl_bench.core.config import Cell
 from mtl_bench.core.files import read_json, write_json
 from mtl_bench.core.locks import claimed_by, is_here
@@ -184,6 +184,7 @@ def data_for(needed: Job, cell: Cell, data: Data | None) -> Data | None:
     return None if needed.id in [each.id for each in before] else data
 
 
+@plugins.listed_once()
 def rows(
     jobs: Iterable[Job],
     runs: Path,
@@ -219,6 +220,7 @@ def all_rows(runs: Path) -> list[dict[str, Any]]:
     return found
 
 
+@plugins.listed_once()
 def to_run(
     jobs: Iterable[Job], runs: Path, rerun: str | None = None, data: Data | None = None
 ) -> list[Job]:
@@ -244,6 +246,7 @@ def to_run(
     return [job for job in with_parents(filter(wanted, jobs)) if wanted(job)]
 
 
+@plugins.listed_once()
 def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None = None) -> str:
     """`done 3   failed 1`, and what to do about some of them."""
     states = [inspect(job, runs, data) for job in jobs]
@@ -254,6 +257,7 @@ def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None 
     return "   ".join(f"{word} {n}{hints.get(word, '')}" for word, n in counts.items() if n)
 
 
+@plugins.listed_once()
 def hours_to_run(todo: Sequence[Job], jobs: Iterable[Job], runs: Path) -> float | None:
     """Expected duration one after another, from those that are done; None where none is."""
     work = seconds = 0.0

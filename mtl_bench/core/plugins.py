@@ -24,6 +24,7 @@ import sys
 import traceback
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -73,6 +74,10 @@ IS_TASK = Rule(
 )
 TOLD = re.compile(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", re.MULTILINE)  # in a section Args
 PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
+
+_listed: ContextVar[dict[tuple[str, str], dict[str, list[Path]]] | None] = ContextVar(
+    "listed", default=None
+)
 
 
 @dataclass(frozen=True)
@@ -144,8 +149,29 @@ def kinds_of(name: str) -> list[str]:
     return [kind for kind in KINDS if name in _candidates(kind)]
 
 
+@contextlib.contextmanager
+def listed_once() -> Iterator[None]:
+    """Within, folders are listed once: for a walk over many jobs, each of which asks for some."""
+    outer = _listed.get()
+    token = _listed.set({} if outer is None else outer)
+    try:
+        yield
+    finally:
+        _listed.reset(token)
+
+
 def _candidates(kind: str, name: str = ANY) -> dict[str, list[Path]]:
-    """Files by name: of one name, whose other files need not be read, or of any."""
+    """Files by name: at least of one name, whose other files need not be read, or of any."""
+    seen = _listed.get()
+    if seen is None:
+        return _found(kind, name)
+    key = kind, os.environ.get(VARIABLE, "")
+    if key not in seen:
+        seen[key] = _found(kind, ANY)
+    return seen[key]
+
+
+def _found(kind: str, name: str) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
     paths = [path for folder in folders(kind) for path in _files_in(folder, name)]
     extra = (Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep))
