@@ -80,7 +80,8 @@ def collect(
             word = "--weights" if weights else f"'{(sources or [])[0]}'"
             raise ValueError(f"{word} does not go with --pack, which packs what is in --runs")
         choice = Choice(grid, recipe, seeds, smoke, settings, pretrained) if grid else None
-        packed, left = collecting.pack(pack, runs, choice and choice.needed(), curves)
+        jobs = None if choice is None else choice.needed()
+        packed, left = collecting.pack(pack, runs, jobs, curves)
         typer.echo(f"packed {packed} of {runs} in {pack}, {pack.stat().st_size / 1024:.0f} KiB")
     for line in collecting.told(left):
         typer.echo(line)
