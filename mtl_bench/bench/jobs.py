@@ -325,7 +325,7 @@ class Timings(Kind[Timing]):
         }
 
     def headline(self, metric: Mapping[str, Any]) -> str:
-        if "latency.mean_ms" not in metric:
+        if not {"latency.mean_ms", "latency.fps"} <= metric.keys():
             return ""
         noisy = "  noisy" * bool(metric.get("latency.noisy"))
         return f"{metric['latency.mean_ms']:.1f} ms  FPS {metric['latency.fps']:.1f}{noisy}"

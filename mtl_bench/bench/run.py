@@ -274,7 +274,8 @@ def _result_of(
     if not state.trained or state.row is None or not path.is_file():
         word = f"here without its {file}" if state.trained else state.word
         why = f" ({state.why})" if state.why else ""
-        raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: run that one again")
+        remedy = "run that one again" + ", or collect it with that" * state.trained
+        raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: {remedy}")
     if file == CHECKPOINT:
         checkpoint.require(path, parent)
     return state.row, path

@@ -72,21 +72,25 @@ def read_row(path: Path, job: Job) -> dict[str, Any] | None:
     Raises:
         ValueError: it is damaged, or another job's.
     """
-    row, kind = read_json(path), kind_of(job)
-    if row is None:
-        return None
+    row = read_json(path)
+    if row is not None and (wrong := fault(row, job)):
+        raise ValueError(f"{path} is {wrong}; delete it to run its {kind_of(job).noun} again")
+    return row
+
+
+def fault(row: Mapping[str, Any], job: Job) -> str:
+    """Why a row cannot be this job's; empty where it can."""
+    kind = kind_of(job)
     own = kind.identity(job)
     for key in row.keys() & kind.owner:
         if row[key] != own[key]:
-            why = f"its {key} is {row[key]}, not {own[key]}"
-            raise ValueError(f"{path} is another {kind.noun}'s: {why}; delete it to run this one")
+            return f"another {kind.noun}'s: its {key} is {row[key]}, not {own[key]}"
     wrong = [section for section in row.keys() & SECTIONS if not isinstance(row[section], dict)]
     for section in {"metric", "time"}.difference(wrong):
         wrong += [key for key, value in row.get(section, {}).items() if not _fits(key, value)]
-    if wrong or not row:
-        why = f"its '{wrong[0]}'" if wrong else "it says nothing"
-        raise ValueError(f"{path} is damaged ({why}); delete it to run its cell again")
-    return row
+    if wrong:
+        return f"damaged (its '{wrong[0]}')"
+    return "" if row else "damaged (it says nothing)"
 
 
 def _fits(key: str, value: Any) -> bool:
@@ -308,10 +312,20 @@ def begin(cell: Cell, runs: Path, data: Data | None = None) -> tuple[Path, str]:
 
 
 def can_renew(cell: Cell, runs: Path, data: Data | None = None) -> bool:
-    """Whether a stale row can be brought up to date, or at least tried, without training."""
-    state = stored(cell, runs, data)
-    there = cell.single_task or (run_dir(cell, runs) / "last.pt").is_file()
-    return state.word == "stale" and there and (state.trained or unsure(state.stale))
+    """Whether a stale row can be brought up to date, or at least tried, without training.
+
+    Raises:
+        ValueError: it could, were its weights here: nobody asked for a training.
+    """
+    state, weights = stored(cell, runs, data), run_dir(cell, runs) / "last.pt"
+    if state.word != "stale" or not (state.trained or unsure(state.stale)):
+        return False
+    if not cell.single_task and not weights.is_file():
+        raise ValueError(
+            f"{state.why}, and {weights} is not here to evaluate again: mtl-bench collect "
+            f"--weights brings it, --rerun trains anew"
+        )
+    return True
 
 
 def unsure(stale: Mapping[str, str]) -> bool:

@@ -267,6 +267,14 @@ class Choice:
             say=partial(typer.echo, err=True),
         )
 
+    def needed(self) -> "Sequence[Job]":
+        """The jobs, and all that they and their deltas need."""
+        from mtl_bench.bench import references
+        from mtl_bench.bench.jobs import with_parents
+
+        grid = self.load()
+        return with_parents([*grid.jobs, *references.baselines(grid)])
+
     @property
     def command(self) -> str:
         """How to run the same jobs again; files without their folders."""

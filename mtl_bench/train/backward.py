@@ -115,7 +115,7 @@ def backward(
         with perturbed(second, batches[0], shared, frozen_statistics(model)) as parts:
             return step.on_one_batch([parts], lr, cosines)
     if isinstance(second, GradientReplay):
-        return step.by_given_weights(batches[0], *second.weights_HT, cosines)
+        return step.by_given_weights(batches[0], second.weights_HT, cosines)
     if isinstance(second, CrossMethod):
         return step.on_three_batches(batches, cosines)
     return step.on_one_batch(batches, lr, cosines)
@@ -300,9 +300,10 @@ class _ByGradients:
         return _weighting(self.method, seen.losses, seen.step, weight_K, measured, head_K=head_K)
 
     def by_given_weights(
-        self, parts: Sequence[Forward], weight_T: Tensor, head_T: Tensor, cosines: bool
+        self, parts: Sequence[Forward], weights_2T: Tensor, cosines: bool
     ) -> Weighting:
-        """One weighted pass, with weights that are known before."""
+        """One weighted pass, with weights that are known before: of what is shared, and not."""
+        weight_T, head_T = weights_2T
         seen, measured = self._weighted_pass(parts, self.terms, weight_T, head_T, cosines)
         step = _step_of(self.method, seen)
         here, losses = step.present, mean_losses(seen)
