@@ -13,7 +13,6 @@ import json
 import math
 import os
 import signal
-import subprocess
 import time
 import traceback
 from abc import ABC, abstractmethod
@@ -25,9 +24,9 @@ from typing import Any, Protocol
 
 from mtl_bench.bench import store
 from mtl_bench.bench.data_state import Data
+from mtl_bench.bench.executors import Processes, Task
 from mtl_bench.bench.jobs import Job, Timing, kind_of, with_parents
 from mtl_bench.bench.jobs import lack as lack_of
-from mtl_bench.bench.preloaded import PROGRAM, Forked, can_fork
 from mtl_bench.bench.store import State
 from mtl_bench.core import locks
 from mtl_bench.core.config import Cell
@@ -37,7 +36,6 @@ from mtl_bench.core.provenance import cores
 
 INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a job that was told to stop
 POLL_S = 0.2
-GRACE_S = 30.0  # for a cell to save its state after Ctrl-C
 ORDERED = "MTL_BENCH_ORDERED"  # set by who starts a cell only when what it needs is done
 
 CellCommand = Callable[[Cell], Sequence[str]]
@@ -66,7 +64,6 @@ class Run(ABC):
     name: str = ""  # the grid's, where it has names
     began: float = field(default_factory=time.monotonic)
     progress: Mapping[str, Any] = field(default_factory=dict)  # of its `progress.json`
-    process: "subprocess.Popen[bytes] | Forked | None" = None
     gpu: str | None = None  # that it has, as CUDA_VISIBLE_DEVICES names it
     _stage: tuple[str, int, float] = ("", 0, 0.0)  # name, first step seen, when
 
@@ -255,6 +252,7 @@ class Launcher:
     smoke: bool = False
     data: Data | None = None
     gpus: Sequence[str] = ()
+    _processes: Processes = field(default_factory=Processes)
     _running: list[Run] = field(default_factory=list)
     _unsettled: set[str] = field(default_factory=set)  # ids whose jobs have not ended here yet
     _elsewhere: set[str] = field(default_factory=set)  # ids that another process was seen running
@@ -351,26 +349,18 @@ class Launcher:
             run.gpu = min(self.gpus, key=taken.count)
         self._running.append(run)
         environment = child_environment(self.jobs, run.gpu)
-        if isinstance(run, CellRun) and can_fork(command):
-            run.process = Forked(command[len(PROGRAM) :], run.log, environment)
-        else:
-            with run.log.open("ab") as log:
-                run.process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    env=environment,
-                    start_new_session=True,  # Ctrl-C reaches it once, through `_stop`
-                )
+        task = Task(
+            run.job.id, command, run.log, environment=environment, fork=isinstance(run, CellRun)
+        )
+        self._processes.submit([task])
         self.display.started(run)
 
     def _reap(self, queue: deque[Run]) -> None:
+        states = self._processes.states()
         for run in list(self._running):
-            assert run.process is not None
             with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
                 run.see(json.loads((run.log.parent / "progress.json").read_text()))
-            code = run.process.poll()
+            code = states[run.job.id].code
             if code is None:
                 continue
             self._running.remove(run)
@@ -396,23 +386,26 @@ class Launcher:
         self.display.ended(run, "  ".join(words), ok)
 
     def _stop(self) -> None:
-        """Forward the interruption and wait; a second Ctrl-C or half a minute kills."""
-        processes = [run.process for run in self._running if run.process is not None]
-        for process in processes:
-            process.send_signal(signal.SIGINT)
+        """Forward the interruption and wait."""
         saving = sum(not isinstance(run.job, Timing) for run in self._running)
         if saving:
             self.display.say(f"stopping {saving} running cells; they save their state")
-        deadline = time.monotonic() + GRACE_S
-        try:
-            for process in processes:
-                process.wait(max(0.0, deadline - time.monotonic()))
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            for process in processes:
-                process.kill()
-                process.wait()
+        self._processes.cancel()
         for run in self._running:
             run.release()
+
+
+def queued_tasks(
+    todo: Sequence[Cell], runs: Path, command: CellCommand, rerun: str | None, data: Data | None
+) -> list[Task]:
+    """What a queue is given for cells that nobody runs, each with its place made ready."""
+    tasks = []
+    for cell in todo:
+        run = CellRun(1, 1, cell, runs, command=command, data=data)
+        words = run.prepare(store.inspect(cell, runs, data), rerun)
+        after = tuple(parent.id for parent in cell.parents)
+        tasks.append(Task(cell.id, words, run.log, after))
+    return tasks
 
 
 def gpu_pool(visible: str | None, count: int) -> tuple[str, ...]:

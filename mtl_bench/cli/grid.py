@@ -3,6 +3,7 @@
 import itertools
 import os
 import shlex
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -20,6 +21,11 @@ if TYPE_CHECKING:
     from mtl_bench.bench.grid import Grid
     from mtl_bench.bench.jobs import Job, Timing
     from mtl_bench.core.recipe import Recipe
+
+
+class On(StrEnum):
+    local = "local"
+    slurm = "slurm"
 
 
 class Rerun(StrEnum):
@@ -70,6 +76,22 @@ def ablate(
             show_default=False,
         ),
     ] = None,
+    where: Annotated[
+        On,
+        typer.Option(
+            "--on",
+            help="slurm: queue the cells, at most --jobs at a time, and return; see "
+            "docs/clusters.md.",
+        ),
+    ] = On.local,
+    slurm: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME=VALUE,...",
+            help="Options of sbatch, such as partition=gpu,time=4:00:00,gpus=1.",
+            show_default=False,
+        ),
+    ] = "",
     data: o.DataOption = None,
     runs: o.RunsOption = Path("runs"),
     reports: o.ReportsOption = Path("reports"),
@@ -87,13 +109,21 @@ def ablate(
     from mtl_bench.bench import references, store
     from mtl_bench.bench.data_state import Data
     from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.bench.slurm import options_of
 
+    sbatch = options_of(slurm)
+    if sbatch and where is not On.slurm:
+        raise ValueError("--slurm is for --on slurm")
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
     chosen = choice.load(device)
     if chosen.kind is not CELLS and (jobs or 1) > 1:
         raise ValueError(f"--jobs {jobs}: a latency is taken with nothing else of ours running")
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
+    if where is On.slurm and chosen.kind is not CELLS:
+        raise ValueError(
+            "--on slurm queues cells; latencies are taken on a machine that you choose"
+        )
     against = references.baselines(chosen)
     chosen.kind.check([*chosen.jobs, *against])
     if chosen.kind is CELLS and not dry_run:  # it imports pandas
@@ -108,6 +138,10 @@ def ablate(
             o.locate(job, data)  # a wrong folder is told at once
     if not quiet or dry_run:
         _announce(chosen, first, runs, rerun, given)
+    if where is On.slurm:
+        passed_on = ["--wandb", wandb.value, "--device", device.value, "--quiet"]
+        _queue(first, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run)
+        return
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
         return
@@ -147,20 +181,25 @@ def status(
 ) -> None:
     """List a grid's cells: done, stale, failed, interrupted, running or missing.
 
-    Those that are in no row of the grid but needed by one are marked as such.
+    Those that are in no row of the grid but needed by one are marked as such. Of cells that are in
+    Slurm's queue stands what Slurm says.
     """
     from mtl_bench.bench import store
     from mtl_bench.bench.jobs import TIMINGS, with_parents
     from mtl_bench.core.locks import claimed_by
 
     chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
+    from mtl_bench.bench.slurm import Slurm
+
     own, names = _named(chosen, runs)
     every = with_parents(own)
     known = {job.id for job in own} if chosen.tune else {job.id for job in chosen.jobs}
+    queue = Slurm(runs).states() if shutil.which("squeue") else {}
     lines = []
     for job in every:
         state = store.inspect(job, runs)
-        about = "  ".join(filter(None, (state.why, state.headline)))
+        queued = queue[job.id].about if job.id in queue and state.row is None else ""
+        about = "  ".join(filter(None, (state.why, state.headline, queued)))
         if isinstance(job, Cell):
             name = names.get(job.id, "") if job.id in known else "(needed by another)"
             named = [name] if names or len(every) > len(known) else []
@@ -470,6 +509,52 @@ def _run(
             runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given, gpus=gpus
         )
         launcher.run(todo)
+
+
+def _queue(
+    todo: "Sequence[Job]",
+    runs: Path,
+    data: Path | None,
+    given: "Data",
+    options: list[str],
+    sbatch: Mapping[str, str],
+    cap: int | None,
+    rerun: str | None,
+    dry_run: bool,
+) -> None:
+    """Hand what nobody runs or has queued to Slurm. What they train on is rendered before, once."""
+    from mtl_bench.bench import jobs as kinds
+    from mtl_bench.bench import launch, store
+    from mtl_bench.bench.executors import Task
+    from mtl_bench.bench.slurm import FOLDER, Slurm, arrays
+
+    queue = Slurm(runs, sbatch, cap)
+    states = {} if dry_run else queue.states()
+    busy = [cell for cell in todo if store.status(cell, runs) == "running"]
+    busy += [cell for cell in todo if cell.id in states and states[cell.id].word != "ended"]
+    cells = [cell for cell in todo if isinstance(cell, Cell) and cell not in busy]
+    if dry_run:
+        shape = [Task(cell.id, (), runs, tuple(each.id for each in cell.parents)) for cell in cells]
+        for number, array in enumerate(arrays(shape)):
+            typer.echo(queue.script(runs.resolve() / FOLDER / f"TOKEN{number}", len(array)))
+        typer.echo("nothing was queued (--dry-run)")
+        return
+    roots = {cell.recipe.data: o.data_root(cell, data, quiet=True) for cell in cells}
+
+    def command(cell: Cell) -> list[str]:
+        return kinds.cell_command(cell, runs, roots[cell.recipe.data], options)
+
+    queue.submit(launch.queued_tasks(cells, runs, command, rerun, given))
+    numbers = " ".join(map(str, queue.submitted))
+    if busy:
+        typer.echo(f"{len(set(busy))} cells run or are queued already")
+    if cells:
+        typer.echo(
+            f"queued {len(cells)} cells as Slurm's jobs {numbers}; `status` shows them, "
+            f"`scancel {numbers}` ends them, and once they are done `report` writes the report"
+        )
+    else:
+        typer.echo("nothing to queue")
 
 
 def _rows(grid: "Grid", runs: Path, data: "Data | None" = None) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ from mtl_bench.core.files import replacing
 from mtl_bench.core.locks import STEP_S, Quiet
 from mtl_bench.core.provenance import cores
 
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)  # the last: a queue's time limit is near
 WINDOW = 20  # steps whose median is their pace
 SLOW = 2.0  # times the first window's pace, of which the log tells
 
@@ -35,13 +36,15 @@ class Progress:
         self.stop_asked = False
 
     def catch_signals(self) -> None:
-        """Turn the first SIGINT or SIGTERM into a request; a second one kills as usual."""
-        for number in (signal.SIGINT, signal.SIGTERM):
+        """Turn a signal into a request. A second SIGINT kills as usual; of the others a queue may
+        send several."""
+        for number in STOPPING:
             signal.signal(number, self._ask_to_stop)
 
     def _ask_to_stop(self, number: int, frame: FrameType | None) -> None:
         self.stop_asked = True
-        signal.signal(number, signal.SIG_DFL)
+        if number == signal.SIGINT:
+            signal.signal(number, signal.SIG_DFL)
 
     def say(self, line: str) -> None:
         self._echo(line)

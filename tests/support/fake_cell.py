@@ -30,12 +30,14 @@ def note(directory: Path, word: str) -> None:
 
 
 def interrupt(number, frame):
+    signal.signal(number, signal.SIG_IGN)  # a queue may send it again
     raise KeyboardInterrupt
 
 
 def main() -> None:
     action, seconds, code, file, *options = sys.argv[1:]
     signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGUSR1, interrupt)
     directory = Path(file).parent
     if action == "silent":
         sys.exit(0)
@@ -49,7 +51,8 @@ def main() -> None:
             write_json(directory / "code.json", json.loads(code))
             state = {"stage": "train", "step": 1, "steps": 2, "seconds": 1.0, "note": "loss 1"}
             write_json(directory / "progress.json", state)
-            time.sleep(float(seconds))
+            again = (directory / "saved").exists()
+            time.sleep(0 if action == "resume" and again else float(seconds))
             if action == "fail":
                 store.write_failure(directory, "ValueError: on purpose", "Traceback ...")
                 sys.exit(1)
@@ -64,6 +67,7 @@ def main() -> None:
         sys.exit(CLAIMED)
     except KeyboardInterrupt:
         note(directory, "saved")
+        (directory / "saved").touch()
         sys.exit(130)
 
 
