@@ -577,7 +577,7 @@ def _rows(grid: "Grid", runs: Path, data: "Data | None" = None) -> list[dict[str
 def _write(
     grid: "Grid", rows: list[dict[str, Any]], runs: Path, reports: Path, command: str
 ) -> Path:
-    from mtl_bench.bench import references
+    from mtl_bench.bench import references, tuning
     from mtl_bench.bench.jobs import CELLS
 
     out = reports / grid.name
@@ -585,7 +585,8 @@ def _write(
         from mtl_bench.report import grid as of_cells
 
         trivial = references.trivial(grid, runs)
-        return of_cells.build(grid, rows, out, runs_root=runs, baseline=trivial, command=command)
+        tried = tuning.tried(grid, runs) if grid.tune is not None else ()
+        return of_cells.build(grid, rows, out, runs, trivial, command, tried)
     from mtl_bench.report import latency as of_timings
 
     return of_timings.build(grid, rows, out, references.quality(grid, runs), command)

@@ -71,8 +71,12 @@ def per_class() -> dict[str, Column]:
 def figures() -> dict[str, str]:
     """Stems of the figures that a grid's report may have -> their headings, in the page's order."""
     return {
-        **{f"{y.name}_{x.name}": against(y, x) for y, x in pairs()},
         "forest": "Against the control",
+        "bands": "How far ranks go",
+        "profiles": "Performance profiles",
+        "budgets": "What a budget of tuning buys",
+        "tradeoff": "Trade-off of tasks, and the control's front",
+        **{f"{y.name}_{x.name}": against(y, x) for y, x in pairs()},
         "samples": "Sample predictions",
         "extremes": "Worst and best frame of each row",
         **{stem: capital(f"{c.in_words} per class") for stem, c in per_class().items()},
@@ -100,7 +104,9 @@ def measured(row: Row, column: Column) -> float:
     """A row's value in the column's unit; NaN where it has none."""
     value = row.get("metric", {}).get(column.key)
     if value is None:
-        value = flatten(row).get(column.key)
+        value = row
+        for part in column.key.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
     return math.nan if value is None else float(value) * column.scale
 
 
