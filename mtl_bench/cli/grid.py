@@ -138,9 +138,13 @@ def ablate(
             o.locate(job, data)  # a wrong folder is told at once
     if not quiet or dry_run:
         _announce(chosen, first, runs, rerun, given)
+    steps = itertools.chain([first], (_left(each, runs, rerun, given) for each in phases))
     if where is On.slurm:
         passed_on = ["--wandb", wandb.value, "--device", device.value, "--quiet"]
-        _queue(first, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run)
+        todo = next(filter(None, steps), [])
+        _queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run)
+        if chosen.tune and todo and not dry_run:
+            typer.echo("once they are done, the same command queues what follows from them")
         return
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
@@ -148,7 +152,7 @@ def ablate(
     ran = False
     gpus = _gpus(chosen, device)
     options = ["--wandb", wandb.value]
-    for todo in itertools.chain([first], (_left(each, runs, rerun, given) for each in phases)):
+    for todo in steps:
         ran = ran or bool(todo)
         if todo:
             several = jobs or _side_by_side(chosen, todo, gpus)

@@ -50,7 +50,7 @@ def test_a_curve_is_the_mean_over_all_draws_and_problems(tried):
 
 def test_trials_of_several_seeds_are_one_setting():
     (one,) = suite_trials({}, 1, {"digits": PROBLEMS["digits"]})
-    other = replace(one, score=one.score + 2, task_scores={k: 1.0 for k in one.task_scores})
+    other = replace(one, score=one.score + 2, task_scores=dict.fromkeys(one.task_scores, 1.0))
     (setting,) = trials.ended([one, other])[CONTROL, "digits"]
     assert setting.score == one.score + 1
     assert setting.seconds == 20
