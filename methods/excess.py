@@ -27,8 +27,11 @@ class ExcessMTL(GradientMethod):
             the built-in data has 100 steps each.
     """
 
+    space = {"eta": {"log": [0.01, 1.0]}}
+
     needs = "jacobian"
     weighted_heads = True
+    replayable = True
     log_weight_T: Tensor  # logarithms, from which a weight can return after it was 0
     base_T: Tensor  # e(0)
     count_T: Tensor

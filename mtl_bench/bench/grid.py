@@ -43,9 +43,10 @@ rows say one, or with settings of its own:
     suite = ["a", "b", { recipe = "c", backbone = "d", "recipe.data.val_scenes" = 200 }]
 
 `method` and `backbone` stand in the axes or in every row; a file without [[row]] is the axes alone.
-Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, recipe,
-recipe.SECTION.KEY, method.KEY, backbone.KEY. Under [baseline] a cell keeps recipe, backbone and
-seed, and nothing else of its own. A wrong key is told with its line.
+Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, replay,
+recipe, recipe.SECTION.KEY, method.KEY, backbone.KEY. Under [baseline] a cell keeps recipe, backbone
+and seed, and nothing else of its own. A wrong key is told with its line. `replay` trains a row with
+the weights that its method logged, whose own run need not be in the grid: see train/replay.py.
 
 A grid of timings says which networks to time, at which sizes, on which engines:
 
@@ -80,6 +81,7 @@ device, recipe, backbone.KEY of the plug-in, weights.BACKBONE, quality.recipe. A
 engine does not have on the device is skipped.
 """
 
+import functools
 import itertools
 import math
 from abc import ABC, abstractmethod
@@ -174,6 +176,7 @@ def baseline_cell(cell: Cell, settings: Values) -> Cell:
     plain = replace(
         cell,
         tasks=cell.recipe.tasks,
+        replay=None,
         video=False,
         single_task=False,
         granularity="terms",
@@ -465,9 +468,15 @@ def _check_tuned(points: "_CellPoints", grid: Grid, tune: Tune) -> None:
                 "trials",
                 ("tune", 0),
             )
-    for values in draws(tune, grid.jobs[0])[1:]:
+    places = (("tune.space", 0), ("tune", 0))
+    try:
+        drawn = draws(tune, grid.jobs[0])[1:]
+    except ValueError as error:
+        key = next((key for key in tune.space if key in str(error)), "")
+        raise file.error(str(error), key, *places) from error
+    for values in drawn:
         own = {key: value for key, value in values.items() if key in tune.space}
-        points.set(grid.jobs[0], own, ("tune.space", 0), ("tune", 0))
+        points.set(grid.jobs[0], own, *places)
 
 
 def _suite(file: TomlFile, recipe: str | None) -> dict[str, Values]:
@@ -520,6 +529,7 @@ class _CellPoints(Points):
     settings: Sequence[str]
     suite: Mapping[str, Values] = field(default_factory=lambda: NOTHING)
     smoke: bool = False
+    load: Callable[[str], Recipe] = field(default_factory=lambda: functools.cache(load_recipe))
 
     def make(self, values: dict[str, Any], row: int) -> Cell:
         """Its values, then `--set`, then what multiplies a number."""
@@ -527,7 +537,7 @@ class _CellPoints(Points):
         recipe = values.pop("recipe", None)
         if recipe is not None:
             try:
-                loaded = load_recipe(str(recipe))
+                loaded = self.load(str(recipe))
             except ValueError as error:
                 raise self.file.error(str(error), "recipe", *places) from error
             if recipe in self.suite:

@@ -266,6 +266,8 @@ class Cells(Kind[Cell]):
             values["pretrained"] = Path(job.pretrained).name
         if job.continues is not None:
             values["continues"] = job.continues.slug
+        if job.replay is None:
+            del values["replay"]
         keys = ("method", "backbone", "tasks", "seed", "video", "single_task", "granularity")
         return {
             "cell_id": job.id,
@@ -323,7 +325,7 @@ class Timings(Kind[Timing]):
         }
 
     def headline(self, metric: Mapping[str, Any]) -> str:
-        if "latency.mean_ms" not in metric:
+        if not {"latency.mean_ms", "latency.fps"} <= metric.keys():
             return ""
         noisy = "  noisy" * bool(metric.get("latency.noisy"))
         return f"{metric['latency.mean_ms']:.1f} ms  FPS {metric['latency.fps']:.1f}{noisy}"

@@ -32,6 +32,7 @@ from mtl_bench.train.loop import CHECKPOINT, train
 from mtl_bench.train.progress import Interrupted, Progress
 from mtl_bench.train.tracking import Tracker
 
+CURVE = "curve.csv"
 TAKEN = "taken.json"  # what training took beside the curve's steps, for a run that is continued
 
 
@@ -188,13 +189,17 @@ def _train(
     tracker: Tracker,
     data: Data,
 ) -> Trained:
-    """Train, from the parent's checkpoint on where there is one; a video cell also on labels that
-    this one made."""
+    """Train, from the parent's checkpoint on where there is one, or with the weights of its curve;
+    a video cell also on labels that this one made."""
     taken: dict[str, Any] = read_json(run_dir / TAKEN) or {}
-    start = further_labels = None
+    start = record = further_labels = None
     protocol = {}
     for parent in cell.parents:
-        _, start = _result_of(parent, run_dir.parent, store.data_for(parent, cell, data))
+        of_parent = store.data_for(parent, cell, data)
+        if cell.replay is not None:
+            _, record = _result_of(parent, run_dir.parent, of_parent, CURVE)
+        else:
+            _, start = _result_of(parent, run_dir.parent, of_parent)
     if cell.video:
         assert start is not None
         further_labels, frames = _pseudo_labels(
@@ -205,7 +210,9 @@ def _train(
         torch.cuda.reset_peak_memory_stats(compute.device)
     given = (cell, root, run_dir, compute, progress, tracker)
     rehearsal = partial(rehearse, cell=cell, root=root, device=compute.device)
-    model = train(*given, start=start, further_labels=further_labels, rehearse=rehearsal)
+    model = train(
+        *given, start=start, further_labels=further_labels, record=record, rehearse=rehearsal
+    )
     taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(compute.device))
     write_json(run_dir / TAKEN, taken)
     train_s, step_ms = training_time(run_dir / "curve.csv")
@@ -254,19 +261,23 @@ def _trained_apart(cell: Cell, run_dir: Path, compute: Compute, data: Data) -> T
     return Trained(load_model(cell, run_dir / CHECKPOINT, compute), took, {})
 
 
-def _result_of(parent: Cell, runs: Path, data: Data | None) -> tuple[dict[str, Any], Path]:
-    """Row and checkpoint of a cell that another needs.
+def _result_of(
+    parent: Cell, runs: Path, data: Data | None, file: str = CHECKPOINT
+) -> tuple[dict[str, Any], Path]:
+    """Row and checkpoint, or another file, of a cell that another needs.
 
     Raises:
         ValueError: it lacks one of them, or they are of other code or data.
     """
     state = store.stored(parent, runs, data)
-    path = store.run_dir(parent, runs) / CHECKPOINT
+    path = store.run_dir(parent, runs) / file
     if not state.trained or state.row is None or not path.is_file():
-        word = "without its checkpoint" if state.trained else state.word
+        word = f"here without its {file}" if state.trained else state.word
         why = f" ({state.why})" if state.why else ""
-        raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: run that one again")
-    checkpoint.require(path, parent)
+        remedy = "run that one again" + ", or collect it with that" * state.trained
+        raise ValueError(f"this cell needs {path.parent}, which is {word}{why}: {remedy}")
+    if file == CHECKPOINT:
+        checkpoint.require(path, parent)
     return state.row, path
 
 

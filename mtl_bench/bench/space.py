@@ -134,7 +134,7 @@ def _value(cell: Cell, key: str, where: Any, shares: Sequence[float]) -> Any:
         return _simplex(cell, of, shares)
     low, high = (times(cell, key, bound) if isinstance(bound, str) else bound for bound in of)
     if not (_is_number(low) and _is_number(high)):
-        raise ValueError(f"[tune] space: {key} is no number that {of[0]} could be times of")
+        raise ValueError(f"{key} is no number here that {of[0]} could be times of")
     value = (
         math.exp(math.log(low) + shares[0] * math.log(high / low))
         if form == "log"

@@ -22,6 +22,7 @@ runs/latency/                             of timings
 
 import shutil
 import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,15 +30,17 @@ from typing import Any
 
 from mtl_bench.bench.data_state import STAGES, Data
 from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_parents
-from mtl_bench.core import provenance
+from mtl_bench.core import plugins, provenance
 from mtl_bench.core.config import Cell
 from mtl_bench.core.files import read_json, write_json
-from mtl_bench.core.locks import claimed_by
+from mtl_bench.core.locks import claimed_by, is_here
 from mtl_bench.core.plain import to_dict
 
 SECTIONS = ("metric", "protocol", "time", "code", "data", "env", "cell", "timing")  # of a row
 TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
 ASIDE = "set-aside-"
+ELSEWHERE = "on another machine"
+SHOWN_S = 60.0  # for a file that another machine has written to be seen on a shared folder
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
 
 
@@ -69,21 +72,25 @@ def read_row(path: Path, job: Job) -> dict[str, Any] | None:
     Raises:
         ValueError: it is damaged, or another job's.
     """
-    row, kind = read_json(path), kind_of(job)
-    if row is None:
-        return None
+    row = read_json(path)
+    if row is not None and (wrong := fault(row, job)):
+        raise ValueError(f"{path} is {wrong}; delete it to run its {kind_of(job).noun} again")
+    return row
+
+
+def fault(row: Mapping[str, Any], job: Job) -> str:
+    """Why a row cannot be this job's; empty where it can."""
+    kind = kind_of(job)
     own = kind.identity(job)
     for key in row.keys() & kind.owner:
         if row[key] != own[key]:
-            why = f"its {key} is {row[key]}, not {own[key]}"
-            raise ValueError(f"{path} is another {kind.noun}'s: {why}; delete it to run this one")
+            return f"another {kind.noun}'s: its {key} is {row[key]}, not {own[key]}"
     wrong = [section for section in row.keys() & SECTIONS if not isinstance(row[section], dict)]
     for section in {"metric", "time"}.difference(wrong):
         wrong += [key for key, value in row.get(section, {}).items() if not _fits(key, value)]
-    if wrong or not row:
-        why = f"its '{wrong[0]}'" if wrong else "it says nothing"
-        raise ValueError(f"{path} is damaged ({why}); delete it to run its cell again")
-    return row
+    if wrong:
+        return f"damaged (its '{wrong[0]}')"
+    return "" if row else "damaged (it says nothing)"
 
 
 def _fits(key: str, value: Any) -> bool:
@@ -106,9 +113,23 @@ def inspect(job: Job, runs: Path, data: Data | None = None) -> State:
     Args:
         data: those that it would run on; a row of others is stale. None: not known.
     """
-    if claimed_by(run_dir(job, runs)) is not None:
-        return State("running")
+    if (owner := claimed_by(run_dir(job, runs))) is not None:
+        return State("running", "" if not owner or is_here(owner) else ELSEWHERE)
     return stored(job, runs, data)
+
+
+def inspect_done(job: Job, runs: Path, data: Data | None = None) -> State:
+    """As `inspect`, of a job that is known to be done: what a shared folder's cache does not show
+    yet is waited for."""
+    deadline = time.monotonic() + SHOWN_S
+    state = inspect(job, runs, data)
+    while state.word in ("missing", "interrupted", "running") and time.monotonic() < deadline:
+        time.sleep(0.5)
+        for folder in (runs, run_dir(job, runs)):
+            if folder.is_dir():
+                list(folder.iterdir())  # reading a folder asks the server what is in it
+        state = inspect(job, runs, data)
+    return state
 
 
 def stored(job: Job, runs: Path, data: Data | None = None) -> State:
@@ -167,6 +188,7 @@ def data_for(needed: Job, cell: Cell, data: Data | None) -> Data | None:
     return None if needed.id in [each.id for each in before] else data
 
 
+@plugins.listed_once()
 def rows(
     jobs: Iterable[Job],
     runs: Path,
@@ -202,6 +224,7 @@ def all_rows(runs: Path) -> list[dict[str, Any]]:
     return found
 
 
+@plugins.listed_once()
 def to_run(
     jobs: Iterable[Job], runs: Path, rerun: str | None = None, data: Data | None = None
 ) -> list[Job]:
@@ -227,6 +250,7 @@ def to_run(
     return [job for job in with_parents(filter(wanted, jobs)) if wanted(job)]
 
 
+@plugins.listed_once()
 def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None = None) -> str:
     """`done 3   failed 1`, and what to do about some of them."""
     states = [inspect(job, runs, data) for job in jobs]
@@ -237,6 +261,7 @@ def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None 
     return "   ".join(f"{word} {n}{hints.get(word, '')}" for word, n in counts.items() if n)
 
 
+@plugins.listed_once()
 def hours_to_run(todo: Sequence[Job], jobs: Iterable[Job], runs: Path) -> float | None:
     """Expected duration one after another, from those that are done; None where none is."""
     work = seconds = 0.0
@@ -287,10 +312,20 @@ def begin(cell: Cell, runs: Path, data: Data | None = None) -> tuple[Path, str]:
 
 
 def can_renew(cell: Cell, runs: Path, data: Data | None = None) -> bool:
-    """Whether a stale row can be brought up to date, or at least tried, without training."""
-    state = stored(cell, runs, data)
-    there = cell.single_task or (run_dir(cell, runs) / "last.pt").is_file()
-    return state.word == "stale" and there and (state.trained or unsure(state.stale))
+    """Whether a stale row can be brought up to date, or at least tried, without training.
+
+    Raises:
+        ValueError: it could, were its weights here: nobody asked for a training.
+    """
+    state, weights = stored(cell, runs, data), run_dir(cell, runs) / "last.pt"
+    if state.word != "stale" or not (state.trained or unsure(state.stale)):
+        return False
+    if not cell.single_task and not weights.is_file():
+        raise ValueError(
+            f"{state.why}, and {weights} is not here to evaluate again: mtl-bench collect "
+            f"--weights brings it, --rerun trains anew"
+        )
+    return True
 
 
 def unsure(stale: Mapping[str, str]) -> bool:

@@ -20,6 +20,7 @@ from mtl_bench.bench.grid import Grid, baseline_cell
 from mtl_bench.bench.jobs import CELLS, Job, with_parents
 from mtl_bench.bench.references import baselines
 from mtl_bench.bench.space import draws, value_of
+from mtl_bench.core import plugins
 from mtl_bench.core.columns import Column
 from mtl_bench.core.config import Cell, set_values
 from mtl_bench.core.quality import quality
@@ -84,6 +85,7 @@ def problems(grid: Grid) -> tuple[str, ...]:
 
 
 @functools.lru_cache(maxsize=2)
+@plugins.listed_once()
 def trials(grid: Grid) -> tuple[Trial, ...]:
     """All, problem by problem, the published settings of all lines first.
 
@@ -104,6 +106,7 @@ def trials(grid: Grid) -> tuple[Trial, ...]:
     )
 
 
+@plugins.listed_once()
 def tried(
     grid: Grid, runs: Path, data: Data | None = None, of: Collection[str] | None = None
 ) -> tuple[Tried, ...]:
@@ -136,6 +139,7 @@ def chosen(
     return found
 
 
+@plugins.listed_once()
 def finals(
     grid: Grid, runs: Path, data: Data | None = None, of: Collection[str] | None = None
 ) -> tuple[Final, ...]:
@@ -178,6 +182,7 @@ class Part:
         return store.hours_to_run([*todo, *self.open], with_parents(self.cells), runs)
 
 
+@plugins.listed_once()
 def part(grid: Grid, problem: str, runs: Path, data: Data | None = None) -> Part:
     """How far a problem is."""
     found = finals(grid, runs, data, [problem])
@@ -187,6 +192,7 @@ def part(grid: Grid, problem: str, runs: Path, data: Data | None = None) -> Part
     return Part(problem, tried(grid, runs, data, [problem]), found, left)
 
 
+@plugins.listed_once()
 def results(
     grid: Grid, runs: Path, data: Data | None = None
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:

@@ -16,7 +16,19 @@ from typing import Any, NoReturn
 
 import typer
 
-from mtl_bench.cli import cell, data, deploy, figure, grid, help, look, predict, pseudo, score
+from mtl_bench.cli import (
+    cell,
+    collect,
+    data,
+    deploy,
+    figure,
+    grid,
+    help,
+    look,
+    predict,
+    pseudo,
+    score,
+)
 from mtl_bench.core.locks import CLAIMED, ClaimedError
 
 TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
@@ -54,7 +66,7 @@ class Group(help.Group):
 
 
 app = help.App(Group, name="mtl-bench", epilog="Example: mtl-bench ablate --grid backbones")
-for module in (grid, cell, score, pseudo, predict, figure, deploy, data, look):
+for module in (grid, collect, cell, score, pseudo, predict, figure, deploy, data, look):
     module.register(app)
 
 
@@ -69,7 +81,8 @@ def main() -> None:
         os.environ.setdefault(name, value)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # a file's name goes out as it is
-    signal.signal(signal.SIGTERM, _interrupt)
+    for number in (signal.SIGTERM, signal.SIGUSR1):  # the latter: a queue's time limit is near
+        signal.signal(number, _interrupt)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _interrupt)  # under nohup it is ignored, and stays so
     app(prog_name="mtl-bench")

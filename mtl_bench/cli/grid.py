@@ -1,7 +1,9 @@
 """`ablate`, `status` and `report`: a grid of cells or of timings."""
 
 import itertools
+import os
 import shlex
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -19,6 +21,11 @@ if TYPE_CHECKING:
     from mtl_bench.bench.grid import Grid
     from mtl_bench.bench.jobs import Job, Timing
     from mtl_bench.core.recipe import Recipe
+
+
+class On(StrEnum):
+    local = "local"
+    slurm = "slurm"
 
 
 class Rerun(StrEnum):
@@ -54,8 +61,8 @@ def ablate(
             "--jobs",
             metavar="N",
             min=1,
-            help="Cells at a time; they share the cores. Without it as many as there are cores, on "
-            "a GPU one.",
+            help="Cells at a time; they share the cores, and the GPUs that CUDA_VISIBLE_DEVICES "
+            "names. Without it one a GPU, or else one a core.",
             show_default=False,
         ),
     ] = None,
@@ -69,6 +76,22 @@ def ablate(
             show_default=False,
         ),
     ] = None,
+    where: Annotated[
+        On,
+        typer.Option(
+            "--on",
+            help="slurm: queue the cells, at most --jobs at a time, and return; see "
+            "docs/clusters.md.",
+        ),
+    ] = On.local,
+    slurm: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME=VALUE,...",
+            help="Options of sbatch, such as partition=gpu,time=4:00:00,gpus=1.",
+            show_default=False,
+        ),
+    ] = "",
     data: o.DataOption = None,
     runs: o.RunsOption = Path("runs"),
     reports: o.ReportsOption = Path("reports"),
@@ -86,13 +109,21 @@ def ablate(
     from mtl_bench.bench import references, store
     from mtl_bench.bench.data_state import Data
     from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.bench.slurm import options_of
 
+    sbatch = options_of(slurm)
+    if sbatch and where is not On.slurm:
+        raise ValueError("--slurm is for --on slurm")
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
     chosen = choice.load(device)
     if chosen.kind is not CELLS and (jobs or 1) > 1:
         raise ValueError(f"--jobs {jobs}: a latency is taken with nothing else of ours running")
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
+    if where is On.slurm and chosen.kind is not CELLS:
+        raise ValueError(
+            "--on slurm queues cells; latencies are taken on a machine that you choose"
+        )
     against = references.baselines(chosen)
     chosen.kind.check([*chosen.jobs, *against])
     if chosen.kind is CELLS and not dry_run:  # it imports pandas
@@ -107,16 +138,25 @@ def ablate(
             o.locate(job, data)  # a wrong folder is told at once
     if not quiet or dry_run:
         _announce(chosen, first, runs, rerun, given)
+    steps = itertools.chain([first], (_left(each, runs, rerun, given) for each in phases))
+    if where is On.slurm:
+        passed_on = ["--wandb", wandb.value, "--device", device.value, "--quiet"]
+        todo = next(filter(None, steps), [])
+        _queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run)
+        if chosen.tune and todo and not dry_run:
+            typer.echo("once they are done, the same command queues what follows from them")
+        return
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
         return
     ran = False
+    gpus = _gpus(chosen, device)
     options = ["--wandb", wandb.value]
-    for todo in itertools.chain([first], (_left(each, runs, rerun, given) for each in phases)):
+    for todo in steps:
         ran = ran or bool(todo)
         if todo:
-            several = jobs or _side_by_side(chosen, todo, device)
-            _run(chosen, todo, runs, data, given, options, device, several, rerun, quiet)
+            several = jobs or _side_by_side(chosen, todo, gpus)
+            _run(chosen, todo, runs, data, given, options, device, several, gpus, rerun, quiet)
     if chosen.kind is CELLS:
         references.measure_trivial(
             chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=ran
@@ -145,20 +185,25 @@ def status(
 ) -> None:
     """List a grid's cells: done, stale, failed, interrupted, running or missing.
 
-    Those that are in no row of the grid but needed by one are marked as such.
+    Those that are in no row of the grid but needed by one are marked as such. Of cells that are in
+    Slurm's queue stands what Slurm says.
     """
     from mtl_bench.bench import store
     from mtl_bench.bench.jobs import TIMINGS, with_parents
     from mtl_bench.core.locks import claimed_by
 
     chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
+    from mtl_bench.bench.slurm import Slurm
+
     own, names = _named(chosen, runs)
     every = with_parents(own)
     known = {job.id for job in own} if chosen.tune else {job.id for job in chosen.jobs}
+    queue = Slurm(runs).states() if shutil.which("squeue") else {}
     lines = []
     for job in every:
         state = store.inspect(job, runs)
-        about = "  ".join(filter(None, (state.why, state.headline)))
+        queued = queue[job.id].about if job.id in queue and state.row is None else ""
+        about = "  ".join(filter(None, (state.why, state.headline, queued)))
         if isinstance(job, Cell):
             name = names.get(job.id, "") if job.id in known else "(needed by another)"
             named = [name] if names or len(every) > len(known) else []
@@ -264,6 +309,14 @@ class Choice:
             device=device.value,
             say=partial(typer.echo, err=True),
         )
+
+    def needed(self) -> "Sequence[Job]":
+        """The jobs, and all that they and their deltas need."""
+        from mtl_bench.bench import references
+        from mtl_bench.bench.jobs import with_parents
+
+        grid = self.load()
+        return with_parents([*grid.jobs, *references.baselines(grid)])
 
     @property
     def command(self) -> str:
@@ -399,15 +452,29 @@ def _skipped(grid: "Grid") -> list[str]:
     return [f"  skipped {reasons.count(why)}: {why}" for why in dict.fromkeys(reasons)]
 
 
-def _side_by_side(grid: "Grid", todo: "Sequence[Job]", device: o.Device) -> int:
-    """A cell a core on the CPU, where two processes of one thread do more steps than one of two."""
-    from mtl_bench.bench.jobs import CELLS, kind_of
+def _gpus(grid: "Grid", device: o.Device) -> tuple[str, ...]:
+    """What cells are spread over; a timing takes the GPU that it would take in a terminal."""
+    from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.bench.launch import gpu_pool
     from mtl_bench.core.device import choose_device
+
+    if grid.kind is not CELLS or choose_device(device.value).type != "cuda":
+        return ()
+    import torch
+
+    return gpu_pool(os.environ.get("CUDA_VISIBLE_DEVICES"), torch.cuda.device_count())
+
+
+def _side_by_side(grid: "Grid", todo: "Sequence[Job]", gpus: Sequence[str]) -> int:
+    """A cell a GPU. Without one a cell a core: two processes of one thread do more steps than one
+    of two."""
+    from mtl_bench.bench.jobs import CELLS, kind_of
     from mtl_bench.core.provenance import cores
 
-    if grid.kind is not CELLS or choose_device(device.value).type != "cpu":
+    if grid.kind is not CELLS:
         return 1
-    return min(cores(), sum(kind_of(job).work(job) > 0 for job in todo) or 1)
+    trained = sum(kind_of(job).work(job) > 0 for job in todo) or 1
+    return min(len(gpus) or cores(), trained)
 
 
 def _run(
@@ -419,6 +486,7 @@ def _run(
     options: list[str],
     device: o.Device,
     jobs: int,
+    gpus: Sequence[str],
     rerun: str | None,
     quiet: bool,
 ) -> None:
@@ -441,8 +509,56 @@ def _run(
     bars = grid.kind is kinds.CELLS  # which would draw while something is timed
     names = _named(grid, runs)[1]
     with display.choose(len(todo), quiet, bars) as shown:
-        launcher = Launcher(runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given)
+        launcher = Launcher(
+            runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given, gpus=gpus
+        )
         launcher.run(todo)
+
+
+def _queue(
+    todo: "Sequence[Job]",
+    runs: Path,
+    data: Path | None,
+    given: "Data",
+    options: list[str],
+    sbatch: Mapping[str, str],
+    cap: int | None,
+    rerun: str | None,
+    dry_run: bool,
+) -> None:
+    """Hand what nobody runs or has queued to Slurm. What they train on is rendered before, once."""
+    from mtl_bench.bench import jobs as kinds
+    from mtl_bench.bench import launch, store
+    from mtl_bench.bench.executors import Task
+    from mtl_bench.bench.slurm import FOLDER, Slurm, arrays
+
+    queue = Slurm(runs, sbatch, cap)
+    states = {} if dry_run else queue.states()
+    busy = [cell for cell in todo if store.status(cell, runs) == "running"]
+    busy += [cell for cell in todo if cell.id in states and states[cell.id].word != "ended"]
+    cells = [cell for cell in todo if isinstance(cell, Cell) and cell not in busy]
+    if dry_run:
+        shape = [Task(cell.id, (), runs, tuple(each.id for each in cell.parents)) for cell in cells]
+        for number, array in enumerate(arrays(shape)):
+            typer.echo(queue.script(runs.resolve() / FOLDER / f"TOKEN{number}", len(array)))
+        typer.echo("nothing was queued (--dry-run)")
+        return
+    roots = {cell.recipe.data: o.data_root(cell, data, quiet=True) for cell in cells}
+
+    def command(cell: Cell) -> list[str]:
+        return kinds.cell_command(cell, runs, roots[cell.recipe.data], options)
+
+    queue.submit(launch.queued_tasks(cells, runs, command, rerun, given))
+    numbers = " ".join(map(str, queue.submitted))
+    if busy:
+        typer.echo(f"{len(set(busy))} cells run or are queued already")
+    if cells:
+        typer.echo(
+            f"queued {len(cells)} cells as Slurm's jobs {numbers}; `status` shows them, "
+            f"`scancel {numbers}` ends them, and once they are done `report` writes the report"
+        )
+    else:
+        typer.echo("nothing to queue")
 
 
 def _rows(grid: "Grid", runs: Path, data: "Data | None" = None) -> list[dict[str, Any]]:

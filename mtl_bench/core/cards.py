@@ -5,6 +5,7 @@ its file, too, be it `mtl_bench/core/method.py` or a helper beside the method.
 """
 
 import ast
+import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -59,7 +60,7 @@ def _card(about: Description) -> Card:
         venue=published[1] if published else "",
         year=published[2] if published else "",
         url=_url(source),
-        needs=str(_declared(line).get("needs", "")),
+        needs=str(plugins.declared_in(line).get("needs", "")),
         extras=tuple(_extras(line)),
         cost=_cost(line),
         settings={k: argument.text for k, argument in plugins.arguments_of(line).items()},
@@ -82,24 +83,12 @@ def _url(source: str) -> str:
 # --- what a line of classes declares --------------------------------------------------------------
 
 
-def _declared(line: Sequence[ast.ClassDef]) -> dict[str, object]:
-    """Class attributes with a constant value; the nearest class counts."""
-    values: dict[str, object] = {}
-    for node in reversed(line):
-        for item in node.body:
-            if isinstance(item, ast.Assign) and isinstance(item.value, ast.Constant):
-                values |= {ast.unparse(target): item.value.value for target in item.targets}
-            elif isinstance(item, ast.AnnAssign) and isinstance(item.value, ast.Constant):
-                values[ast.unparse(item.target)] = item.value.value
-    return values
-
-
 def _is_a(line: Sequence[ast.ClassDef], base: str) -> bool:
     return base in [node.name for node in line]
 
 
 def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
-    values = _declared(line)
+    values = plugins.declared_in(line)
     if values["reevaluates"]:
         yield "the losses after the step"
     if _is_a(line, "LookAheadMethod"):
@@ -114,7 +103,7 @@ def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
 
 def _cost(line: Sequence[ast.ClassDef]) -> str:
     """As `backward` spends it; what the method itself computes is not in it."""
-    values = _declared(line)
+    values = plugins.declared_in(line)
     if values.get("needs") == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
     if _is_a(line, "PerturbedMethod"):
@@ -223,6 +212,9 @@ def _section(card: Card) -> str:
     notes = [f"Source: <{card.url}>." if card.url else ""]
     notes += [f"Needs {', '.join((card.needs, *card.extras))}." if card.needs else ""]
     notes += [f"Hyper-parameters: {settings}." if settings else ""]
+    space = plugins.attributes("methods", card.about.name).get("space", {})
+    drawn = ", ".join(_code(f"{key} = {json.dumps(where)}") for key, where in space.items())
+    notes += [f"Trials draw {drawn}." if drawn else ""]
     return f"### {in_markdown(card.about.name)}\n\n{formula}\n{' '.join(filter(None, notes))}\n"
 
 

@@ -55,6 +55,7 @@ __all__ += ["did_you_mean", "from_dict", "recipe_names", "set_values", "to_dict"
 PROTOCOL = 2  # raised when numbers made before stop being comparable with numbers made after
 RECIPES = Path(__file__).parents[1] / "bench" / "recipes"
 GRANULARITIES = ("terms", "tasks")
+REPLAYS = ("mean", "final", "shuffled", "level")
 FROZEN = "frozen"  # a setting of every backbone: "stem" or "all" of it does not learn
 HASHED = "sha256:"  # before the hash of initial weights whose file is elsewhere
 # Values that recipes have had since protocol 2 began. One that is its default is left out of the
@@ -90,10 +91,11 @@ NOT_SET = {
 class Cell(Checked):
     """One training run and its evaluation.
 
-    Three kinds of cell need others (their `parents`) first: `video` trains its parent's checkpoint
+    Four kinds of cell need others (their `parents`) first: `video` trains its parent's checkpoint
     on, with pseudo labels from it; `continues` trains another cell's checkpoint on, by a recipe of
-    its own; `single_task` trains nothing, and evaluates and times the networks of its parents
-    together.
+    its own; `replay` trains from the start, with the weights that its parent, the same cell
+    without it, has logged; `single_task` trains nothing, and evaluates and times the networks of
+    its parents together.
 
     Raises:
         ValueError: a value that its field cannot have, or options that exclude each other.
@@ -116,6 +118,12 @@ class Cell(Checked):
     ] = None
     method_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     backbone_args: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    replay: Annotated[
+        str | None,
+        one_of(*REPLAYS),
+        "train with the weights that the method gave in a run of its own, not by the method: fixed "
+        "at their mean or final values, shuffled in time, or level: all equal, by their mean",
+    ] = None
     continues: "Cell | None" = None  # whose model and method it goes on from; optimiser anew
 
     def __post_init__(self) -> None:
@@ -131,6 +139,11 @@ class Cell(Checked):
             raise ValueError(
                 "single_task and video exclude each other: the stage needs one network"
             )
+        for other in ("video",) * self.video + ("continues",) * (self.continues is not None):
+            if self.replay is not None:
+                raise ValueError(
+                    f"replay and {other} exclude each other: replayed training begins at step 0"
+                )
         if self.single_task and len(self.tasks) < 2:
             raise ValueError(f"single_task needs two tasks or more, not {list(self.tasks)}")
         if self.continues is not None:
@@ -161,9 +174,11 @@ class Cell(Checked):
 
     @property
     def parents(self) -> tuple["Cell", ...]:
-        """Cells whose checkpoints this one needs."""
+        """Cells whose checkpoints, or of `replay` whose weights, this one needs."""
         if self.single_task:
             return tuple(replace(self, single_task=False, tasks=(task,)) for task in self.tasks)
+        if self.replay is not None:
+            return (replace(self, replay=None),)
         if self.video:
             return (replace(self, video=False),)
         return () if self.continues is None else (self.continues,)
@@ -186,6 +201,7 @@ class Cell(Checked):
         words += ["single-task"] * self.single_task + ["video"] * self.video
         words += ["continued"] * (self.continues is not None)
         words += [] if self.granularity == "terms" else [f"by {self.granularity}"]
+        words += [] if self.replay is None else [f"replay {self.replay}"]
         arguments = [*self.method_args.items(), *self.backbone_args.items()]
         return " ".join([*words, *(f"{key}={value}" for key, value in arguments)])
 
@@ -234,6 +250,8 @@ def canonical_json(cell: Cell) -> str:
         del values["recipe"]["pseudo"]
     for key in ("cache", "workers"):
         del values["recipe"]["data"][key]
+    if cell.replay is None:
+        del values["replay"]
     values.pop("continues")
     if cell.continues is not None:
         values["continues"] = cell.continues.id
@@ -384,6 +402,12 @@ def check_cells(cells: Iterable[Cell]) -> None:
         declared = (plugins.attributes("tasks", task) for task in cell.tasks)
         if cell.video and not any(found.get("makes_labels") for found in declared):
             raise ValueError(f"video needs a task that makes labels, not {', '.join(cell.tasks)}")
+        for name in plugins.part_names(cell.method) if cell.replay is not None else ():
+            if not _replayable(name):
+                raise ValueError(
+                    f"replay={cell.replay}: an update of method '{name}' is no sum of one batch's "
+                    f"gradients by the weights that it logs, so they cannot be trained with again"
+                )
         for kind, name, values in _chosen(cell):
             if (kind, name, tuple(values)) in seen:
                 continue
@@ -395,6 +419,12 @@ def check_cells(cells: Iterable[Cell]) -> None:
                 if key not in known:
                     word = kind[:-1]
                     raise ValueError(f"{word} '{name}' has no '{key}'{did_you_mean(key, known)}")
+
+
+def _replayable(method: str) -> bool:
+    """What the method declares; without that, whether it answers with weights."""
+    declared = plugins.declared("methods", method)
+    return bool(declared.get("replayable", declared.get("needs") != "jacobian"))
 
 
 def check_tasks(tasks: Iterable[str]) -> None:

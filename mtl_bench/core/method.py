@@ -52,6 +52,8 @@ class Method(nn.Module):
 
     needs: Needs
     batches = 1  # independent batches a step
+    replayable: bool  # whether every update is the sum of one batch's gradients by the weights that
+    # it logs, which `replay` can then train with; unsaid: yes, but not where it needs a jacobian
     reevaluates = False  # True: `after_step` gets the batch's losses under the new parameters
     # Hyper-parameters that a grid's trials tune, and where their values lie: see bench/space.py
     space: ClassVar[Mapping[str, Any]] = MappingProxyType({})
@@ -112,7 +114,10 @@ class GradientMethod(Method):
         raise NotImplementedError
 
     def direction(self, J_KP: Tensor, step: Step) -> tuple[Tensor, Tensor]:
-        """Update direction [P] of the shared parameters, and the weights [K] to log."""
+        """Update direction [P] of the shared parameters, and the weights [K] to log.
+
+        A method whose direction is always weights @ J says so: replayable = True.
+        """
         raise NotImplementedError
 
     def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
@@ -133,6 +138,7 @@ class CrossMethod(GradientMethod):
     """
 
     batches = 3
+    replayable = False
 
 
 class LookAheadMethod(GradientMethod):
@@ -140,6 +146,7 @@ class LookAheadMethod(GradientMethod):
 
     needs = "jacobian"
     batches = 2  # one to train on, one to look at
+    replayable = False
 
     def direction_ahead(
         self, J_KP: Tensor, step: Step, ahead: Callable[[Tensor], Tensor], lr: float
@@ -156,6 +163,8 @@ class LookAheadMethod(GradientMethod):
 
 class Wrapper(GradientMethod):
     """A gradient method around another: in `a+b`, what `a` makes of the weights of `b`.
+
+    Unless it says otherwise, nothing.
 
     Args:
         inner: what it is around where nothing is said.
@@ -177,6 +186,9 @@ class Wrapper(GradientMethod):
         self.inner, self.needs, self.weighted_heads = inner, inner.needs, inner.weighted_heads
         return self
 
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        return self.inner.weights(G_KK, step)
+
     def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
         return self.inner.head_weights(weight_K, step)
 
@@ -186,6 +198,8 @@ class PerturbedMethod(Wrapper):
 
     The method that it is around sees those gradients, and the losses where the point is.
     """
+
+    replayable = False
 
     def around(self, inner: GradientMethod) -> Wrapper:
         """Itself, around another method.

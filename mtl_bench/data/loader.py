@@ -78,7 +78,8 @@ def _sizes(sample: Batch) -> dict[str, torch.Size]:
     return {name: value.shape for name, value in sample.fields.items()}
 
 
-Slot = tuple[int, int]  # index of a sample, seed of its augmentation
+# Index of a sample; what the seed of its augmentation is made of, where it has any
+Slot = tuple[int, tuple[str, int, int, int]]
 
 
 def _batch(samples: Samples, slots: list[Slot]) -> Batch:
@@ -93,7 +94,7 @@ def _batch(samples: Samples, slots: list[Slot]) -> Batch:
 
 
 def _drawn(samples: Samples, slots: list[Slot]) -> Iterator[Batch]:
-    return (samples.sample(index, Generator().manual_seed(seed)) for index, seed in slots)
+    return (samples.sample(index, Generator().manual_seed(_hash(*key))) for index, key in slots)
 
 
 def _from_workers(samples: Samples, steps: "_Steps", workers: int, pinned: bool) -> Iterator[Batch]:
@@ -180,8 +181,7 @@ class _Steps:
             first = position * self.batch_size
             indices = _order(self.samples, self.seed, epoch)[first : first + self.batch_size]
             yield [
-                (index, _hash("augment", self.seed, step, slot))
-                for slot, index in enumerate(indices)
+                (index, ("augment", self.seed, step, slot)) for slot, index in enumerate(indices)
             ]
             step += 1
 

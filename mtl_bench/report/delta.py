@@ -53,7 +53,7 @@ def with_single_task_delta(
 
 
 def _but_the_method(row: Row) -> str:
-    method = ("method", "method_args", "granularity", "single_task")
+    method = ("method", "method_args", "granularity", "single_task", "replay")
     return json.dumps({k: v for k, v in row["cell"].items() if k not in method}, sort_keys=True)
 
 

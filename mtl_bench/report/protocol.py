@@ -15,6 +15,7 @@ CELL = {
     "cell.single_task": "one network a task",
     "cell.video": "video stage",
     "cell.granularity": "what is weighed",
+    "cell.replay": "replay of its weights",
     "cell.pretrained": "pre-trained weights",
 }
 SECTIONS = {  # title: dotted prefix of a row

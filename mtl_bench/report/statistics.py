@@ -28,7 +28,7 @@ NOT_NUMBERS = (  # keys of a cell that change no number
 )
 KNOWN = (  # axes in the order in which they stand
     *("method", "backbone", "tasks", "single_task", "video", "granularity"),
-    *("pretrained", "recipe.name"),
+    *("replay", "pretrained", "recipe.name"),
 )
 PROBLEM = ("recipe.name", "backbone", "tasks", "pretrained")  # axes that make a problem of its own
 FEW = 4  # lines of a table: of more, what is bold leads the control by a test

@@ -47,6 +47,7 @@ from mtl_bench.train.gramian import (
     unflatten,
 )
 from mtl_bench.train.perturbed import perturbed
+from mtl_bench.train.replay import GradientReplay
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ class Weighting:
     step: Step
     losses: dict[str, float]  # the loss terms
     weights: dict[str, float]  # derivative of the update with respect to each loss of the method
+    heads: dict[str, float] = field(default_factory=dict)  # those of what is not shared, if apart
     cosines: dict[str, float] = field(default_factory=dict)  # of pairs of task gradients: "a.b"
 
 
@@ -112,6 +114,8 @@ def backward(
         shared = trainable(model.shared_parameters())
         with perturbed(second, batches[0], shared, frozen_statistics(model)) as parts:
             return step.on_one_batch([parts], lr, cosines)
+    if isinstance(second, GradientReplay):
+        return step.by_given_weights(batches[0], second.weights_HT, cosines)
     if isinstance(second, CrossMethod):
         return step.on_three_batches(batches, cosines)
     return step.on_one_batch(batches, lr, cosines)
@@ -196,12 +200,15 @@ def _weighting(
     weight_K: Tensor,
     cosines: dict[str, float],
     total: float | None = None,
+    head_K: Tensor | None = None,
 ) -> Weighting:
     """Tensors as the log has them; the total is the weighted sum where it is not said."""
     total = float(weight_K @ step.loss_K) if total is None else total
     floats = {name: loss.item() for name, loss in losses.items()}
-    weights = dict(zip(_names_of(method, step), weight_K.tolist(), strict=True))
-    return Weighting(total, step, floats, weights, cosines)
+    names = _names_of(method, step)
+    weights = dict(zip(names, weight_K.tolist(), strict=True))
+    heads = {} if head_K is None else dict(zip(names, head_K.tolist(), strict=True))
+    return Weighting(total, step, floats, weights, heads, cosines)
 
 
 # --- loss-value methods ---------------------------------------------------------------------------
@@ -287,8 +294,20 @@ class _ByGradients:
         else:
             weight_K = self._weights(products(seen.rows, seen.rows), first_K, step)
             seen.gradients.back(combine(first_K * weight_K * self.scale, seen.rows))
-        self._add_own(seen.own, seen.names, first_K * self._head_weights(weight_K, step))
-        return _weighting(self.method, seen.losses, seen.step, first_K * weight_K, measured)
+        head_K = first_K * self._head_weights(weight_K, step)
+        self._add_own(seen.own, seen.names, head_K)
+        weight_K = first_K * weight_K
+        return _weighting(self.method, seen.losses, seen.step, weight_K, measured, head_K=head_K)
+
+    def by_given_weights(
+        self, parts: Sequence[Forward], weights_2T: Tensor, cosines: bool
+    ) -> Weighting:
+        """One weighted pass, with weights that are known before: of what is shared, and not."""
+        weight_T, head_T = weights_2T
+        seen, measured = self._weighted_pass(parts, self.terms, weight_T, head_T, cosines)
+        step = _step_of(self.method, seen)
+        here, losses = step.present, mean_losses(seen)
+        return _weighting(self.method, losses, step, weight_T[here], measured, head_K=head_T[here])
 
     def on_three_batches(self, batches: Sequence[Sequence[Forward]], cosines: bool) -> Weighting:
         """Gradients of two batches for the weights, one weighted pass of a third for the update.
@@ -310,8 +329,9 @@ class _ByGradients:
         weight_K = self._weights(products(*rows), first_K, step)
         head_K = first_K * self._head_weights(weight_K, step)
         del seen, rows  # as large as the network, many times
-        losses = self._weighted_pass(batches[2], names, first_K * weight_K, head_K)
-        return _weighting(self.method, losses, plain, first_K * weight_K, measured)
+        weight_K = first_K * weight_K
+        losses = mean_losses(self._weighted_pass(batches[2], names, weight_K, head_K)[0])
+        return _weighting(self.method, losses, plain, weight_K, measured, head_K=head_K)
 
     def _first(self, step: Step) -> tuple[Tensor, Step]:
         """A composition's loss-value method is asked first: its weights, and the step by them."""
@@ -398,23 +418,34 @@ class _ByGradients:
         return _Seen(mean_losses(looked_at), step, names, rows, gradients, means)
 
     def _weighted_pass(
-        self, parts: Sequence[Forward], names: Sequence[str], weight_K: Tensor, head_K: Tensor
-    ) -> dict[str, Tensor]:
+        self,
+        parts: Sequence[Forward],
+        names: Sequence[str],
+        weight_K: Tensor,
+        head_K: Tensor,
+        cosines: bool = False,
+    ) -> tuple[list[Mapping[str, Tensor]], dict[str, float]]:
         """`.grad` of a batch whose losses count `weight` in what is shared, and `head` in the rest.
 
         Losses without a name here are left out.
+
+        Returns:
+            Each part's losses, and cosines of the first one's gradients where they are asked for.
         """
         seen, count, passes = _looked_at(self.method, parts, self.model)
         factors = [self.scale / max(count[name], 1) for name in names]
         factor_K = torch.tensor(factors).to(weight_K)
         own_of: dict[str, list[Tensor | None]] = {}
         total: list[Tensor | None] = [None] * len(self.shared)
-        for passed in passes:
+        measured: dict[str, float] = {}
+        for number, passed in enumerate(passes):
             mine, z = gather(passed.losses, self.method.terms), _trained(passed)
             mine = {name: loss for name, loss in mine.items() if name in names}
             del passed
             if not mine:
                 continue
+            if cosines and number == 0:
+                measured = _measured(mine, z, self.model)
             z_grads = _through_decoders(mine, z, self.own, own_of, 1.0)
             here = [names.index(name) for name in z_grads]
             weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))
@@ -422,7 +453,7 @@ class _ByGradients:
         for parameter, grad in zip(self.shared, total, strict=True):
             parameter.grad = grad
         self._add_own(own_of, names, head_K * factor_K)
-        return mean_losses(seen)
+        return seen, measured
 
     def _add_own(
         self,

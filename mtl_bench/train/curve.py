@@ -12,6 +12,7 @@ from typing import Self
 from mtl_bench.core.files import write_text
 
 REMEDY = "put the right file there, or begin at step 0: train --rerun, ablate --rerun failed"
+WEIGHTS = ("weight.", "head.")
 
 
 class Curve:
@@ -45,7 +46,7 @@ class Curve:
         if self._empty:
             writer.writeheader()
             self._empty = False
-        writer.writerow({k: "" if value is None else f"{value:.6g}" for k, value in row.items()})
+        writer.writerow({key: _text(key, value) for key, value in row.items()})
 
     def flush(self) -> None:
         """What was appended is on the disk, also for a machine that loses its power now."""
@@ -62,6 +63,13 @@ class Curve:
         trace: TracebackType | None,
     ) -> None:
         self._file.close()
+
+
+def _text(key: str, value: float | None) -> str:
+    """Six digits; of weights, which `replay` trains with, the nine that a float32 has."""
+    if value is None:
+        return ""
+    return f"{value:.9g}" if key.startswith(WEIGHTS) else f"{value:.6g}"
 
 
 def read(path: Path) -> list[dict[str, str]]:

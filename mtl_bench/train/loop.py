@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
 from mtl_bench.core.device import Compute, initial_weights, seed_for
-from mtl_bench.core.method import Method, Step
+from mtl_bench.core.method import LossMethod, Method, Step
 from mtl_bench.core.task import Task, tasks_of_cell, terms_of
 from mtl_bench.core.terms import Term
 from mtl_bench.data.loader import train_batches
@@ -24,6 +24,7 @@ from mtl_bench.train.backward import Pass, UnlabelledError, Weighting, backward,
 from mtl_bench.train.compose import compose
 from mtl_bench.train.curve import Curve
 from mtl_bench.train.progress import Interrupted, Pace, Progress
+from mtl_bench.train.replay import Replay, replay_of
 from mtl_bench.train.tracking import Tracker
 
 CHECKPOINT = "last.pt"
@@ -40,6 +41,7 @@ def train(
     *,
     start: Path | None = None,
     further_labels: Path | None = None,
+    record: Path | None = None,
     rehearse: Callable[[Model], None] | None = None,
 ) -> Model:
     """Train a cell to its last step, from its own checkpoint where there is one.
@@ -50,6 +52,7 @@ def train(
         start: checkpoint whose model and method a fresh run goes on from; optimiser and learning
             rate begin anew.
         further_labels: folder of labels of further frames to train on.
+        record: curve of the run whose weights a replay trains with.
         rehearse: is shown the model before the first step, to raise what would stop it after the
             last.
 
@@ -62,6 +65,10 @@ def train(
     optim = cell.recipe.optim
     model, method, optimizer = build(cell, compute)
     path, step = run_dir / CHECKPOINT, 0
+    if isinstance(method, Replay):
+        assert record is not None
+        assert cell.replay is not None
+        method.take(record, optim.steps, cell.replay, seed_for(cell.seed, "replay"))
     if rehearse is not None and not path.is_file():
         rehearse(model)
     torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
@@ -107,6 +114,8 @@ def train(
             ]
             optimizer.zero_grad(set_to_none=True)
             weighting, update_norm, grad_norm = NOTHING, 0.0, 0.0
+            if isinstance(method, Replay):
+                method.at(step)
             try:
                 weighting = backward(
                     method,
@@ -172,8 +181,9 @@ def build(cell: Cell, compute: Compute) -> tuple[Model, Method, torch.optim.Opti
 
 
 def build_method(cell: Cell, terms: Sequence[Term]) -> Method:
-    """The cell's method over these terms."""
-    return compose(cell.method, cell.method_args, terms, seed_for(cell.seed, "method"))
+    """The cell's method over these terms, or what replays it."""
+    method = compose(cell.method, cell.method_args, terms, seed_for(cell.seed, "method"))
+    return method if cell.replay is None else replay_of(method)
 
 
 def schedule(step: int, optim: Optim) -> float:
@@ -268,6 +278,8 @@ def describe_step(
     for name in names:
         row[f"weight.{name}"] = weighting.weights.get(name)
     row["weight_sum"] = sum(weighting.weights.values())
+    for name in () if isinstance(method, LossMethod) else names:
+        row[f"head.{name}"] = weighting.heads.get(name)
     if cosines:
         for first, second in itertools.combinations(names, 2):
             row[f"cosine.{first}.{second}"] = weighting.cosines.get(f"{first}.{second}")

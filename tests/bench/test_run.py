@@ -227,7 +227,7 @@ def test_a_fresh_start_forgets_the_labels(cells, finished, tmp_path):
 
 @pytest.mark.parametrize(
     ("gone", "word"),
-    [("last.pt", "without its checkpoint"), ("row.json", "interrupted"), ("", "stale")],
+    [("last.pt", "here without its last.pt"), ("row.json", "interrupted"), ("", "stale")],
 )
 @pytest.mark.parametrize("child", ["video", "apart"])
 def test_a_parent_without_a_usable_result_is_one_line(

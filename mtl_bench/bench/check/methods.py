@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor, nn
 
+from mtl_bench.bench.space import check as check_space
 from mtl_bench.core.method import (
     GradientMethod,
     LookAheadMethod,
@@ -245,10 +246,24 @@ def _hard_jacobians(size: float) -> dict[str, Tensor]:
 
 
 def _space(kind: type[Method]) -> None:
-    """What may be tuned are hyper-parameters."""
+    """What may be tuned are hyper-parameters, and their values lie where trials can draw them."""
     unknown = set(kind.space) - set(inspect.signature(kind).parameters)
     if unknown:
         raise ValueError(f"space has {sorted(unknown)}, which the constructor does not take")
+    for key, where in kind.space.items():
+        check_space(key, where)
+
+
+def _replayable(kind: type[Method]) -> None:
+    """A direction that can be replayed is that of the weights."""
+    method = kind(LOSSES, seed=0)
+    if method.needs == "jacobian" and getattr(method, "replayable", False):
+        assert isinstance(method, GradientMethod)
+        J_TP = _hard_jacobians(1.0)["random"]
+        step = Step(torch.ones(len(LOSSES)), torch.arange(len(LOSSES)))
+        direction_P, weight_T = method.direction(J_TP.clone(), step)
+        if not torch.allclose(direction_P, weight_T.to(J_TP) @ J_TP, rtol=1e-4, atol=1e-5):
+            raise ValueError("replayable = True, but the direction is not weights @ J")
 
 
 METHOD_CHECKS: dict[str, Callable[[type[Method]], None]] = {
@@ -261,4 +276,5 @@ METHOD_CHECKS: dict[str, Callable[[type[Method]], None]] = {
     "missing labels": _missing_labels,
     "invisible loss scale": _loss_scale,
     "space of hyper-parameters": _space,
+    "replayable": _replayable,
 }

@@ -1,0 +1,287 @@
+"""Results from elsewhere: of other runs folders, and of a grid's rows kept as one file.
+
+What comes in is what `store` calls done by the code of today, and goes where nothing good is yet.
+A pack is text, compressed by xz: a line that says what it is, then a line a job, in the order of
+their folders' names. `xzcat FILE` shows it; the same rows make the same bytes.
+"""
+
+import json
+import lzma
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mtl_bench.bench import store
+from mtl_bench.bench.jobs import Job, Timing, kind_of, load_cell
+from mtl_bench.core.config import Cell, to_travel
+from mtl_bench.core.files import read_json, replacing, write_json, write_text
+from mtl_bench.core.locks import ClaimedError, claim
+from mtl_bench.core.plain import from_dict, to_dict
+from mtl_bench.train import curve
+
+FORMAT = {"format": "mtl-bench rows", "version": 1}
+CURVE = "curve.csv"
+BESIDE = (CURVE, "env.json", "samples.npz")  # what a report reads, and what ran
+WEIGHTS = ("taken.json", "code.json", "last.pt")  # the last: what is there is whole
+PRESET = 6 | lzma.PRESET_EXTREME  # a window of 8 MiB, some hundred rows
+KINDS: dict[str, type[Job]] = {"cell": Cell, "timing": Timing}  # a line's key -> what is in it
+NAMED = 3  # of those that were left out, for each reason
+
+
+@dataclass(frozen=True)
+class Found:
+    """A job's result elsewhere."""
+
+    job: Job
+    row: dict[str, Any]
+    beside: Mapping[str, Path | str] = field(default_factory=dict)  # files, or their text
+
+    @property
+    def name(self) -> str:
+        return self.job.slug
+
+
+@dataclass(frozen=True)
+class Left:
+    """What is not taken, and why."""
+
+    name: str
+    kind: str  # stale | failed | unfinished | unreadable | already here | running here | ...
+    why: str = ""
+
+
+# --- reading --------------------------------------------------------------------------------------
+
+
+def from_folder(runs: Path, weights: bool = False) -> Iterator[Found | Left]:
+    """What is in a runs folder, by name.
+
+    Args:
+        weights: take checkpoints along.
+    """
+    for path in sorted(runs.iterdir()):
+        if (path / "cell.json").is_file() or (path / "row.json").is_file():
+            yield _readable(path.name, partial(_of_cell, path, weights))
+    for path in sorted((runs / "latency").glob("*.json")):
+        yield _readable(f"latency/{path.stem}", partial(_of_timing, path))
+
+
+def _readable(name: str, read: Callable[[], Found | Left]) -> Found | Left:
+    try:
+        return read()
+    except ValueError as error:
+        return Left(name, "unreadable", " ".join(str(error).split()))
+
+
+def _of_cell(directory: Path, weights: bool) -> Found | Left:
+    cell = load_cell(directory / "cell.json")
+    row = store.read_row(directory / "row.json", cell)
+    if row is None:
+        failure = read_json(directory / "failed.json")
+        kind = "unfinished" if failure is None else "failed"
+        return Left(directory.name, kind, str((failure or {}).get("error", "")))
+    names = [*BESIDE, *(WEIGHTS if weights else ())]
+    beside = {name: directory / name for name in names if (directory / name).is_file()}
+    if CURVE in beside:
+        curve.read(directory / CURVE)
+    if "last.pt" in beside:
+        from mtl_bench.train import checkpoint  # takes seconds, for torch
+
+        checkpoint.require(directory / "last.pt", cell)
+    return _judged(Found(cell, row, beside))
+
+
+def _of_timing(path: Path) -> Found | Left:
+    values = (read_json(path) or {}).get("timing")
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{path} is no row of a timing")
+    timing = from_dict(Timing, values)
+    row = store.read_row(path, timing)
+    assert row is not None
+    return _judged(Found(timing, row))
+
+
+def _judged(found: Found) -> Found | Left:
+    """As the store judges a row: done by the code of today, or not."""
+    state = store.state_of(found.row, found.job)
+    return found if state.word == "done" else Left(found.name, state.word, state.why)
+
+
+def read_pack(path: Path) -> Iterator[Found | Left]:
+    """What is in a pack.
+
+    Raises:
+        ValueError: it is no pack, of a newer version, or damaged.
+    """
+    for number, values in enumerate(_lines(path), 2):
+        yield _readable(f"line {number} of {path}", partial(_of_line, values))
+
+
+def _of_line(values: Mapping[str, Any]) -> Found | Left:
+    kind = next((kind for kind in KINDS if isinstance(values.get(kind), dict)), None)
+    if kind is None or not isinstance(row := values.get("row"), dict):
+        raise ValueError("no job with its row")
+    job = from_dict(KINDS[kind], values[kind])
+    if wrong := store.fault(row, job):
+        raise ValueError(f"the row is {wrong}")
+    return _judged(Found(job, row, {CURVE: values[CURVE]} if CURVE in values else {}))
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """What the jobs' lines say."""
+    try:
+        with lzma.open(path, "rt", encoding="utf-8") as file:
+            head = json.loads(next(file, "null"))
+            if not isinstance(head, dict) or head.get("format") != FORMAT["format"]:
+                raise ValueError("it begins with other words")
+            if head.get("version") != FORMAT["version"]:
+                version = head.get("version")
+                raise ValueError(f"it is of version {version}, and this one reads 1")
+            yield from map(json.loads, file)
+    except (lzma.LZMAError, EOFError, ValueError) as error:
+        raise ValueError(
+            f"{path} is no pack of rows, or damaged ({error}); copy it again, or write one with "
+            f"mtl-bench collect --pack"
+        ) from None
+
+
+# --- writing --------------------------------------------------------------------------------------
+
+
+def write_pack(path: Path, jobs: Iterable[Found], curves: bool = False) -> None:
+    """All or nothing: the file appears when it is whole.
+
+    Args:
+        curves: with them, which may be a hundred times as large.
+    """
+    with replacing(path) as file, lzma.open(file, "wb", preset=PRESET) as packed:
+
+        def write(values: Mapping[str, Any]) -> None:
+            packed.write(json.dumps(values, separators=(",", ":")).encode() + b"\n")
+
+        write(FORMAT)
+        for found in sorted(jobs, key=lambda found: found.name):
+            job = found.job
+            own = {"cell": to_travel(job)} if isinstance(job, Cell) else {"timing": to_dict(job)}
+            log = found.beside.get(CURVE)
+            kept = {CURVE: log.read_bytes().decode()} if curves and isinstance(log, Path) else {}
+            write({**own, "row": found.row, **kept})
+
+
+def put(found: Found, runs: Path) -> Left | None:
+    """Take a result into a runs folder, where there is no good one; a stale, failed or unfinished
+    one is set aside. Of one that is here already, files that are not here are taken.
+
+    Returns:
+        Why it is left out; None: it is in.
+    """
+    if isinstance(found.job, Timing):
+        return _put_timing(found, runs)
+    try:
+        with claim(store.run_dir(found.job, runs)):
+            return _put_cell(found, runs)
+    except ClaimedError:
+        return Left(found.name, "running here")
+
+
+def _put_timing(found: Found, runs: Path) -> Left | None:
+    if store.stored(found.job, runs).word == "done":
+        return Left(found.name, "already here")
+    file = kind_of(found.job).row_file(found.job, runs)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_json(file, found.row)
+    return None
+
+
+def _put_cell(found: Found, runs: Path) -> Left | None:
+    directory, here = store.run_dir(found.job, runs), store.stored(found.job, runs)
+    if here.word == "done" and here.row != found.row:
+        return Left(found.name, "already here")
+    lacking = [name for name in found.beside if not (directory / name).is_file()]
+    if here.word == "done" and not lacking:
+        return Left(found.name, "already here")
+    if here.word != "done":
+        store.set_aside(directory, "a collected result takes its place")
+        write_json(directory / "cell.json", to_dict(found.job))
+        lacking = list(found.beside)
+    for name in lacking:
+        _copy(found.beside[name], directory / name)
+    if here.word != "done":
+        write_json(directory / "row.json", found.row)  # last: it is what makes a result
+    return None
+
+
+def _copy(source: Path | str, to: Path) -> None:
+    if isinstance(source, str):
+        write_text(to, source)
+        return
+    with source.open("rb") as opened, replacing(to) as file:
+        shutil.copyfileobj(opened, file)
+
+
+# --- both -----------------------------------------------------------------------------------------
+
+
+def collect(sources: Iterable[Path], runs: Path, weights: bool = False) -> tuple[int, list[Left]]:
+    """Take all that fits from runs folders and packs; how many were taken, and the rest.
+
+    Raises:
+        ValueError: a source that is neither, before anything is taken.
+    """
+    sources = list(sources)
+    for source in sources:
+        if source.is_dir() and source.resolve() == runs.resolve():
+            raise ValueError(f"{source} is --runs itself: name another folder")
+        if source.is_dir() and not any(from_folder(source)):
+            raise ValueError(f"no runs in {source}: a runs folder has folders with a row.json each")
+        for _ in () if source.is_dir() else _lines(source):
+            pass  # a damaged file is told before half of it is in
+    taken, left = 0, []
+    for source in sources:
+        for each in from_folder(source, weights) if source.is_dir() else read_pack(source):
+            why = each if isinstance(each, Left) else put(each, runs)
+            taken += why is None
+            left += [] if why is None else [why]
+    return taken, left
+
+
+def pack(
+    path: Path, runs: Path, jobs: Iterable[Job] | None = None, curves: bool = False
+) -> tuple[int, list[Left]]:
+    """Write a pack of what is done in a runs folder; how many jobs, and what was left out.
+
+    Args:
+        jobs: of these alone; without them, of all that are there.
+
+    Raises:
+        ValueError: there is none.
+    """
+    every = list(from_folder(runs)) if runs.is_dir() else []
+    if jobs is not None:
+        names = {job.slug for job in jobs}
+        every = [each for each in every if each.name in names]
+        here = {each.name for each in every}
+        every += [Left(name, "missing") for name in sorted(names - here)]
+    found = [each for each in every if isinstance(each, Found)]
+    if not found:
+        raise ValueError(f"nothing to pack: no job that is done in {runs}")
+    write_pack(path, found, curves)
+    return len(found), [each for each in every if isinstance(each, Left)]
+
+
+def told(left: Iterable[Left]) -> list[str]:
+    """A line for each kind of what was left out."""
+    kinds: dict[str, list[Left]] = {}
+    for each in left:
+        kinds.setdefault(each.kind, []).append(each)
+    lines = []
+    for kind, several in kinds.items():
+        reasons = list(dict.fromkeys(each.why for each in several if each.why))
+        names = [each.name for each in several]
+        shown = ", ".join([*names[:NAMED], *[f"{len(names) - NAMED} more"] * (len(names) > NAMED)])
+        why = f" ({'; '.join(reasons[:NAMED])})" if reasons else ""
+        lines.append(f"left out, {kind}: {len(names)}{why}: {shown}")
+    return lines
