@@ -31,6 +31,13 @@ RELATIVE = (  # to the reference group's mean; the key is the other column's nam
     Column("step_x", "step_ms", "step", -1, 2, part="cost"),
     Column("train_peak_x", "train_peak_mib", "train peak", -1, 2, part="cost"),
 )
+OF_CONTROL = {  # figures of a grid with a control, the last two of one that is tuned
+    "forest": "Against the control",
+    "bands": "How far ranks go",
+    "profiles": "Performance profiles",
+    "budgets": "What a budget of tuning buys",
+    "tradeoff": "Trade-off of tasks, and the control's front",
+}
 ONLY = {  # what a grid that is about one thing shows
     "cost": ("step_ms", "step_x", "train_peak_mib", "train_peak_x"),
 }
@@ -71,11 +78,7 @@ def per_class() -> dict[str, Column]:
 def figures() -> dict[str, str]:
     """Stems of the figures that a grid's report may have -> their headings, in the page's order."""
     return {
-        "forest": "Against the control",
-        "bands": "How far ranks go",
-        "profiles": "Performance profiles",
-        "budgets": "What a budget of tuning buys",
-        "tradeoff": "Trade-off of tasks, and the control's front",
+        **OF_CONTROL,
         **{f"{y.name}_{x.name}": against(y, x) for y, x in pairs()},
         "samples": "Sample predictions",
         "extremes": "Worst and best frame of each row",

@@ -208,8 +208,7 @@ def _signs(blocks: int) -> Array:
         bits_SB = np.arange(2**blocks)[:, None] >> np.arange(blocks) & 1
     else:
         bits_SB = np.random.default_rng(0).integers(2, size=(FLIPS, blocks))
-    signs_SB: Array = 1.0 - 2 * bits_SB
-    return signs_SB
+    return np.where(bits_SB == 1, -1.0, 1.0)
 
 
 def student(d_B: Array) -> float:

@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mtl_bench.report.columns import Row, in_a_line, text
+from mtl_bench.core.text import in_a_line
+from mtl_bench.report.columns import Row, text
 from mtl_bench.report.table import Head, Section, TableRow
 
 
