@@ -96,13 +96,27 @@ class Slurm:
     cap: int | None = None
     submitted: list[int] = field(default_factory=list)  # Slurm's numbers
 
+    @property
+    def _given(self) -> list[str]:
+        return [
+            f"--{name}={value}" if value else f"--{name}" for name, value in self.options.items()
+        ]
+
+    def check(self) -> None:
+        """Whether it would take a job with these options; nothing is queued.
+
+        Raises:
+            ValueError: it would not, or there is no Slurm here.
+        """
+        _call("sbatch", "--test-only", *self._given, "--wrap", "true")
+
     def script(self, place: Path, tasks: int) -> str:
         """What sbatch gets for an array of so many tasks."""
         cap = "" if self.cap is None else f"%{self.cap}"
-        given = [f"{name}={value}" if value else name for name, value in self.options.items()]
-        own = [f"job-name={NAME}", f"array=0-{tasks - 1}{cap}", f"output={place}/%a.log"]
-        own += ["open-mode=append", "requeue", f"signal=USR1@{NOTICE_S}", "kill-on-invalid-dep=yes"]
-        head = "\n".join(["#!/bin/bash", *(f"#SBATCH --{line}" for line in [*own, *given])])
+        own = [f"--job-name={NAME}", f"--array=0-{tasks - 1}{cap}", f"--output={place}/%a.log"]
+        own += ["--open-mode=append", "--requeue", "--kill-on-invalid-dep=yes"]
+        own += [f"--signal=USR1@{NOTICE_S}"]
+        head = "\n".join(["#!/bin/bash", *(f"#SBATCH {line}" for line in [*own, *self._given])])
         return head + SCRIPT.format(place=shlex.quote(str(place)), claimed=CLAIMED)
 
     def submit(self, tasks: Sequence[Task]) -> None:

@@ -543,6 +543,7 @@ def _queue(
             typer.echo(queue.script(runs.resolve() / FOLDER / f"TOKEN{number}", len(array)))
         typer.echo("nothing was queued (--dry-run)")
         return
+    queue.check()  # before anything is made ready
     roots = {cell.recipe.data: o.data_root(cell, data, quiet=True) for cell in cells}
 
     def command(cell: Cell) -> list[str]:

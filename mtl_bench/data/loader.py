@@ -6,6 +6,7 @@ A run that starts at any step, in one process or several, therefore sees the sam
 
 import dataclasses
 import hashlib
+import signal
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from typing import Any
@@ -105,7 +106,7 @@ def _from_workers(samples: Samples, steps: "_Steps", workers: int, pinned: bool)
         num_workers=workers,
         prefetch_factor=AHEAD,
         pin_memory=pinned,
-        worker_init_fn=_one_thread,
+        worker_init_fn=_begin_worker,
         generator=Generator(),  # else it draws a seed from the global one, which training uses
     )
     batches = iter(loader)
@@ -156,6 +157,13 @@ def _shared(count: int, like: Tensor) -> Tensor:
     """Room for so many such tensors, got in the way of torch's own default_collate."""
     storage = torch.UntypedStorage._new_shared(count * like.nbytes)
     return like.new_empty(0).set_(storage).view(count, *like.shape)
+
+
+def _begin_worker(worker: int) -> None:
+    """A queue sends its signals to every process of a cell; the main one alone answers them."""
+    for number in (signal.SIGTERM, signal.SIGUSR1):
+        signal.signal(number, signal.SIG_IGN)
+    _one_thread(worker)
 
 
 def _one_thread(worker: int) -> None:

@@ -66,6 +66,8 @@ def test_wrong_options_are_one_line(text, why):
 def test_without_slurm_one_line_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ValueError, match="no sbatch here"):
+        Slurm(tmp_path).check()
+    with pytest.raises(ValueError, match="no sbatch here"):
         Slurm(tmp_path).submit([task("a")])
 
 
@@ -141,13 +143,12 @@ def submit(todo, runs, **behaviour):
     return queue
 
 
-def wait_for(condition, seconds=90.0, job=None):
+def wait_for(condition, seconds=90.0):
+    """What is requeued waits until its credential has expired: cred_expire, and a second."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, call("squeue", "-r", "-t", "all")
         time.sleep(0.2)
-        if job is not None:  # what is requeued waits until its credential has expired
-            call("scontrol", "update", f"JobId={job}", "StartTime=now", check=False)
 
 
 def ended(queue):
@@ -202,7 +203,7 @@ def test_what_is_preempted_or_out_of_time_goes_on_later(node, how, tmp_path):
     else:
         call("scancel", "--signal=USR1", job)  # what Slurm sends before the limit, in minutes
     wait_for(lambda: words(tmp_path, cell)[-1] == "saved")
-    wait_for(lambda: store.status(cell, tmp_path) == "done", job=job)
+    wait_for(lambda: store.status(cell, tmp_path) == "done")
     assert words(tmp_path, cell) == ["start", "saved", "start", "end"]
 
 
@@ -212,8 +213,7 @@ def test_a_local_launcher_and_slurm_share_a_grid(node, tmp_path):
     queue = submit(todo, tmp_path, seconds=0.5)
     states = launch.Launcher(tmp_path, fake(tmp_path, seconds=0.5), Lines(quiet=True)).run(todo)
     assert [states[cell.id].word for cell in todo] == ["done"] * 5
-    for number in queue.submitted:
-        wait_for(ended(queue), job=number)
+    wait_for(ended(queue))
     assert [words(tmp_path, cell) for cell in todo] == [["start", "end"]] * 5
 
 
@@ -223,8 +223,11 @@ def test_a_refusal_is_one_line_and_leaves_nothing_queued(node, tmp_path):
     tasks = launch.queued_tasks(
         [parent, replace(parent, video=True)], tmp_path, fake(tmp_path, seconds=60), None, None
     )
-    with pytest.raises(ValueError, match="sbatch says: sbatch: error: invalid partition"):
-        Slurm(tmp_path, {"partition": "none"}).submit(tasks)
+    for act in (Slurm.check, lambda queue: queue.submit(tasks)):
+        with pytest.raises(ValueError, match=r"sbatch says: sbatch: error: .*invalid partition"):
+            act(Slurm(tmp_path, {"partition": "none"}))
+    Slurm(tmp_path, {"partition": "low", "time": "10"}).check()
+    assert Slurm(tmp_path).states() == {}
     queue = Slurm(tmp_path)
     submitted = queue._submit
 
