@@ -91,6 +91,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
+from mtl_bench.bench import sections
 from mtl_bench.bench.jobs import (
     CELLS,
     NOTHING,
@@ -101,8 +102,7 @@ from mtl_bench.bench.jobs import (
     load_cell,
     recipe_of,
 )
-from mtl_bench.bench.space import DEFAULT, TIMES, Tune, draws, times
-from mtl_bench.bench.space import check as check_space
+from mtl_bench.bench.space import TIMES, Tune, times
 from mtl_bench.core import plugins, toml_file
 from mtl_bench.core.config import (
     Cell,
@@ -121,7 +121,6 @@ GRIDS = Path(__file__).parent / "grids"
 MOST = 10_000  # points of one grid: each takes a millisecond to look at, again and again
 MANY = 1000  # of which the number is said before
 SMOKE_STEPS = 6
-SMOKE_TRIALS = 2
 AXES = ("backbone", "size", "tasks", "engine", "precision")  # of timings
 Values: TypeAlias = Mapping[str, Any]
 FORMS: dict[type, str] = {
@@ -381,15 +380,15 @@ def _of_cells(
     say: Callable[[str], None],
 ) -> Grid:
     axes = _axes(file)
-    tune = _tune(file, smoke)
+    tune = sections.tune(file, smoke)
     if seeds is not None:
         if seeds < 1:
             raise ValueError(f"{seeds} seeds: at least 1 is needed")
         axes["seed"] = tuple(range(seeds))
     elif smoke and tune is not None:
         axes["seed"] = axes.get("seed", (0,))[:1]
-    suite = _suite(file, recipe)
-    _check_rows(file, axes, suite)
+    suite = sections.suite(file, recipe)
+    sections.check_rows(file, axes, suite)
     key, otherwise = ("smoke_recipe", "smoke") if smoke else ("recipe", "small")
     first = next(iter(suite), None)
     start = load_recipe(first or recipe or str(file.values.get(key, otherwise)))
@@ -418,108 +417,14 @@ def _of_cells(
     )
     points.set(points.start, baseline, ("baseline", 0))
     if tune is not None and grid.jobs:
-        _check_tuned(points, grid, tune)
+        sections.check_tuned(file, grid.jobs, tune, points.set)
     return grid
-
-
-def _tune(file: TomlFile, smoke: bool) -> Tune | None:
-    """How lines are tuned, in short where it is a smoke run; None where they are not.
-
-    Raises:
-        ValueError: what [tune] cannot be, with its line.
-    """
-    values = file.values.get("tune")
-    if values is None:
-        return None
-    places = (("tune.space", 0), ("tune", 0))
-    for key, where in values.get("space", {}).items():
-        try:
-            check_space(key, where)
-        except ValueError as error:
-            raise file.error(str(error), key, *places) from error
-    try:
-        tune = from_dict(Tune, {"space": DEFAULT, **values}, "tune.")
-    except ValueError as error:
-        key = next((key for key in values if f"'{key}'" in str(error).replace("tune.", "")), "")
-        raise file.error(str(error), key, ("tune", 0)) from error
-    return (
-        replace(tune, trials=min(tune.trials, SMOKE_TRIALS), seeds=tune.seeds[:1])
-        if smoke
-        else tune
-    )
-
-
-def _check_tuned(points: "_CellPoints", grid: Grid, tune: Tune) -> None:
-    """Results have other seeds than trials and another split, and a trial can be set.
-
-    Raises:
-        ValueError: otherwise, with its line.
-    """
-    file = points.file
-    both = sorted({cell.seed for cell in grid.jobs}.intersection(tune.seeds))
-    if both:
-        message = f"seed {both[0]} is a result's, too: trials have seeds of their own"
-        raise file.error(message, "seeds", ("tune", 0))
-    for cell in grid.jobs:
-        if cell.recipe.evaluate.split != "test":
-            raise file.error(
-                f"trials are judged on the split val, and recipe {cell.recipe.name} reports its "
-                f"split {cell.recipe.evaluate.split}: set recipe.evaluate.split to test",
-                "trials",
-                ("tune", 0),
-            )
-    places = (("tune.space", 0), ("tune", 0))
-    try:
-        drawn = draws(tune, grid.jobs[0])[1:]
-    except ValueError as error:
-        key = next((key for key in tune.space if key in str(error)), "")
-        raise file.error(str(error), key, *places) from error
-    for values in drawn:
-        own = {key: value for key, value in values.items() if key in tune.space}
-        points.set(grid.jobs[0], own, *places)
-
-
-def _suite(file: TomlFile, recipe: str | None) -> dict[str, Values]:
-    """Recipe -> what the suite sets of its cells; of the one that was asked for, where one was.
-
-    Raises:
-        ValueError: an entry that is no recipe's name and no table with one.
-    """
-    found: dict[str, Values] = {}
-    for entry in file.values.get("suite", []):
-        values = dict(entry) if isinstance(entry, dict) else {"recipe": entry}
-        name = values.pop("recipe", None)
-        if not isinstance(name, str):
-            message = 'a suite lists recipes: "NAME" or { recipe = "NAME", KEY = VALUE }'
-            raise file.error(message, "suite", ("", 0))
-        found[name] = values
-    return {recipe: found.get(recipe, NOTHING)} if found and recipe else found
 
 
 def _smoke_of(recipe: Recipe) -> Recipe:
     """A recipe for as many steps as show that it runs."""
     optim = replace(recipe.optim, steps=SMOKE_STEPS, warmup_steps=2)
     return replace(recipe, smoke=True, optim=optim, latency=Latency(passes=5, warmup=1))
-
-
-def _check_rows(file: TomlFile, axes: Values, suite: Values) -> None:
-    """Each has a name of its own and no axis in it; method and backbone are somewhere, the latter
-    of a suite in its recipes."""
-    rows: list[Values] = file.values.get("row", [])
-    names = [row.get("name") for row in rows]
-    for index, (row, name) in enumerate(zip(rows, names, strict=True)):
-        place = ("row", index)
-        if not isinstance(name, str):
-            raise file.error("a [[row]] needs its name: name = '...'", "name", place)
-        if name in names[:index]:
-            raise file.error(f"two rows are called '{name}'", "name", place)
-        for key in row:
-            if key in axes:
-                raise file.error(f"'{key}' is an axis; it cannot stand in a row, too", key, place)
-    for key in ("method", "backbone"):
-        without = [index for index, row in enumerate(rows or [{}]) if key not in row]
-        if key not in axes and without and not (suite and key == "backbone"):
-            raise file.error(f"'{key}' is missing", "name", ("row", without[0]), ("axes", 0))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,106 @@
+"""What sections of a grid file of cells say, and what is wrong with them, told with its line."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from mtl_bench.bench.jobs import NOTHING
+from mtl_bench.bench.space import DEFAULT, Tune, check, draws
+from mtl_bench.core.config import Cell
+from mtl_bench.core.plain import from_dict
+from mtl_bench.core.toml_file import TomlFile
+
+SMOKE_TRIALS = 2
+
+
+def tune(file: TomlFile, smoke: bool) -> Tune | None:
+    """How lines are tuned, in short where it is a smoke run; None where they are not.
+
+    Raises:
+        ValueError: what [tune] cannot be, with its line.
+    """
+    values = file.values.get("tune")
+    if values is None:
+        return None
+    places = (("tune.space", 0), ("tune", 0))
+    for key, where in values.get("space", {}).items():
+        try:
+            check(key, where)
+        except ValueError as error:
+            raise file.error(str(error), key, *places) from error
+    try:
+        found = from_dict(Tune, {"space": DEFAULT, **values}, "tune.")
+    except ValueError as error:
+        key = next((key for key in values if f"'{key}'" in str(error).replace("tune.", "")), "")
+        raise file.error(str(error), key, ("tune", 0)) from error
+    if smoke:
+        found = replace(found, trials=min(found.trials, SMOKE_TRIALS), seeds=found.seeds[:1])
+    return found
+
+
+def check_tuned(
+    file: TomlFile, cells: Sequence[Cell], tune: Tune, set_values: Callable[..., Cell]
+) -> None:
+    """Results have other seeds than trials and another split, and a trial can be set.
+
+    Raises:
+        ValueError: otherwise, with its line.
+    """
+    both = sorted({cell.seed for cell in cells}.intersection(tune.seeds))
+    if both:
+        message = f"seed {both[0]} is a result's, too: trials have seeds of their own"
+        raise file.error(message, "seeds", ("tune", 0))
+    for cell in cells:
+        if cell.recipe.evaluate.split != "test":
+            raise file.error(
+                f"trials are judged on the split val, and recipe {cell.recipe.name} reports its "
+                f"split {cell.recipe.evaluate.split}: set recipe.evaluate.split to test",
+                "trials",
+                ("tune", 0),
+            )
+    places = (("tune.space", 0), ("tune", 0))
+    try:
+        drawn = draws(tune, cells[0])[1:]
+    except ValueError as error:
+        key = next((key for key in tune.space if key in str(error)), "")
+        raise file.error(str(error), key, *places) from error
+    for values in drawn:
+        own = {key: value for key, value in values.items() if key in tune.space}
+        set_values(cells[0], own, *places)
+
+
+def suite(file: TomlFile, recipe: str | None) -> dict[str, Mapping[str, Any]]:
+    """Recipe -> what the suite sets of its cells; of the one that was asked for, where one was.
+
+    Raises:
+        ValueError: an entry that is no recipe's name and no table with one.
+    """
+    found: dict[str, Mapping[str, Any]] = {}
+    for entry in file.values.get("suite", []):
+        values = dict(entry) if isinstance(entry, dict) else {"recipe": entry}
+        name = values.pop("recipe", None)
+        if not isinstance(name, str):
+            message = 'a suite lists recipes: "NAME" or { recipe = "NAME", KEY = VALUE }'
+            raise file.error(message, "suite", ("", 0))
+        found[name] = values
+    return {recipe: found.get(recipe, NOTHING)} if found and recipe else found
+
+
+def check_rows(file: TomlFile, axes: Mapping[str, Any], suite: Mapping[str, Any]) -> None:
+    """Each has a name of its own and no axis in it; method and backbone are somewhere, the latter
+    of a suite in its recipes."""
+    rows: list[Mapping[str, Any]] = file.values.get("row", [])
+    names = [row.get("name") for row in rows]
+    for index, (row, name) in enumerate(zip(rows, names, strict=True)):
+        place = ("row", index)
+        if not isinstance(name, str):
+            raise file.error("a [[row]] needs its name: name = '...'", "name", place)
+        if name in names[:index]:
+            raise file.error(f"two rows are called '{name}'", "name", place)
+        for key in row:
+            if key in axes:
+                raise file.error(f"'{key}' is an axis; it cannot stand in a row, too", key, place)
+    for key in ("method", "backbone"):
+        without = [index for index, row in enumerate(rows or [{}]) if key not in row]
+        if key not in axes and without and not (suite and key == "backbone"):
+            raise file.error(f"'{key}' is missing", "name", ("row", without[0]), ("axes", 0))
