@@ -19,6 +19,7 @@ from mtl_bench.core import files, provenance
 from mtl_bench.core.config import Cell, Recipe, load_recipe
 from mtl_bench.core.files import read_json, write_json
 from mtl_bench.core.plain import to_dict
+from mtl_bench.train import checkpoint
 
 METHODS = ("fixed", "nash", "rlw")
 
@@ -143,8 +144,6 @@ def test_a_good_result_takes_the_place_of_what_is_none_and_nothing_trained_is_lo
 
 
 def test_weights_come_where_they_are_asked_for_also_later(other, tmp_path, monkeypatch):
-    from mtl_bench.train import checkpoint
-
     monkeypatch.setattr(checkpoint, "require", lambda path, cell: None)
     runs = tmp_path / "runs"
     run(other, "--runs", runs)
@@ -168,6 +167,8 @@ def test_a_stale_row_without_weights_is_not_trained_again_unasked(other, tmp_pat
     write_json(runs / cell.slug / "row.json", row)
     with pytest.raises(ValueError, match=r"evaluate: harness changed, and .*last.pt is not here"):
         store.can_renew(cell, runs)
+    with pytest.raises(ValueError, match=r"no checkpoint .*last.pt; mtl-bench collect --weights"):
+        checkpoint.read(runs / cell.slug / "last.pt")
     row["code"]["train"]["harness"] = "another"
     write_json(runs / cell.slug / "row.json", row)
     assert not store.can_renew(cell, runs)  # what there was would be of no use
