@@ -29,8 +29,8 @@ from mtl_bench.data.samples import Samples, open_samples
 NOISE = 0.62  # of 255, standard deviation
 
 
-def make_tree(out: Path, count: int) -> Path:
-    scenes.write(out, 1024, 2048, count, 1, 0, frames=3)
+def make_tree(out: Path, count: int, size: tuple[int, int] = (1024, 2048)) -> Path:
+    scenes.write(out, *size, count, 1, 0, frames=3)
     random, sizes = np.random.default_rng(0), []
     for path in sorted(out.rglob("*_leftImg8bit.png")):
         image = cv2.imread(str(path))

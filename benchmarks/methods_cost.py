@@ -1,8 +1,9 @@
 """Step time and peak memory of every weighting method, over `fixed` and beside torchjd's.
 
-    python benchmarks/methods_cost.py [--granularity terms] [NAME ...] > cost.md
+    python benchmarks/methods_cost.py [--granularity terms] [--tasks 40] [NAME ...] > cost.md
 
-The network is the real one: ResNet18, the recipe `small` (64 x 128, batch 8). A step is forward,
+The network is the real one: ResNet18, the recipe `small` (64 x 128, batch 8); with `--tasks K`
+CelebA's cnn9 and K of its attributes (64 x 64, batch 16). A step is forward,
 backward and method, for every method with its defaults; the optimiser's step is the same for all
 and is left out. Every ratio is of two steps that ran one after the other, in alternating order, so
 that what else the machine does cancels; medians over the rounds are printed, with quartiles. On one
@@ -197,18 +198,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help="methods (default: all)")
     parser.add_argument("--granularity", choices=("tasks", "terms"), default="tasks")
+    parser.add_argument(
+        "--tasks", type=int, help="in place of `small` the network cnn9 with so many attributes"
+    )
+    parser.add_argument("--recipe", default="small", help="smoke: only shows that it runs")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument(
         "--rounds", type=int, default=15, help="four times as many for loss-value methods"
     )
     parser.add_argument("--quick", action="store_true", help="two rounds: only shows that it runs")
     given = parser.parse_args()
-    bench = open_bench(given.granularity, choose_device(given.device))
+    device = choose_device(given.device)
+    bench = open_bench(given.granularity, device, given.tasks, given.recipe)
     costs = {card.about.name: card.cost for card in cards.cards()}
     names = [plugins.path_of("methods", name).stem for name in given.names] or list(costs)
     rounds = 2 if given.quick else given.rounds
     loss_only = [name for name in names if "K" not in costs[name]]
-    setting = fastest_setting(bench, rounds) if aggregation is not None else None
+    twins = {*AGGREGATORS, *TWO_BATCH_WEIGHTINGS}.intersection(names)
+    setting = fastest_setting(bench, rounds) if twins and aggregation is not None else None
     results = list(measure(bench, loss_only, rounds if given.quick else 4 * rounds, None))
     rest = [name for name in names if name not in loss_only]
     results += measure(bench, rest, rounds, setting)
@@ -218,7 +225,7 @@ def main() -> None:
     print(
         f"torch {torch.__version__} on {where}, {torch.get_num_threads()} threads; "
         f"K = {len(bench.terms)} ({given.granularity}); {rounds} rounds, "
-        f"{len(results[0].ours_s)} of loss-value methods; torchjd: {setting or 'not installed'}.\n"
+        f"{len(results[0].ours_s)} of loss-value methods; torchjd: {setting or 'not run'}.\n"
     )
     print(table(results, costs, peak_mib(bench, partial(our_step, bench, BASE))))
     print("\n" + "\n".join([f"{cards.LEGEND}", *verdicts(results, costs)]))

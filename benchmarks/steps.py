@@ -8,7 +8,7 @@ are not computed, and the third batch has one weighted backward pass.
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -35,6 +35,7 @@ Step = Callable[[], None]
 BASE = "fixed"
 LR = 1e-3  # for methods that look ahead
 MOST = 3  # batches a step
+SAMPLES = 16  # a batch of attributes
 
 # Ours -> torchjd's, at our defaults where it has none; `K` losses.
 AGGREGATORS: dict[str, Callable[[int], nn.Module]] = {
@@ -95,8 +96,17 @@ class Bench:
             torch.cuda.synchronize()
 
 
-def open_bench(granularity: str, device: torch.device) -> Bench:
-    recipe = load_recipe("small")
+def open_bench(
+    granularity: str, device: torch.device, tasks: int | None = None, recipe: str = "small"
+) -> Bench:
+    """Args:
+    tasks: so many attributes of random images in place of the recipe's two tasks.
+    """
+    return two_tasks(granularity, device, recipe) if tasks is None else many_tasks(tasks, device)
+
+
+def two_tasks(granularity: str, device: torch.device, name: str) -> Bench:
+    recipe = load_recipe(name)
     data = replace(recipe.data, train_scenes=16, val_scenes=4, frames=3)
     cell = Cell(replace(recipe, data=data), "resnet18", BASE, granularity=granularity)
     model, method, _ = build(cell, Compute(device))
@@ -105,7 +115,33 @@ def open_bench(granularity: str, device: torch.device) -> Bench:
     for task in model.tasks:
         task.begin(samples.dataset)
     batches = itertools.islice(train_batches(samples, recipe.optim.batch, 0), MOST)
+    return bench_of(cell, model, method.terms, batches, device)
 
+
+def many_tasks(count: int, device: torch.device) -> Bench:
+    """CelebA's network and so many of its attributes; what an image shows changes no time."""
+    recipe = load_recipe("celeba-cnn9")
+    data, names = recipe.data, recipe.tasks[:count]
+    cell = Cell(recipe, recipe.backbone, BASE, tasks=names, granularity="tasks")
+    model, method, _ = build(cell, Compute(device))
+    model.train()
+    draw = torch.Generator().manual_seed(0)
+
+    def batch() -> Batch:
+        shape = (SAMPLES, 3, data.height, data.width)
+        truth = {task.field: torch.rand(SAMPLES, 1, generator=draw).round() for task in model.tasks}
+        return Batch([""] * SAMPLES, torch.rand(shape, generator=draw), None, truth)
+
+    return bench_of(cell, model, method.terms, [batch() for _ in range(MOST)], device)
+
+
+def bench_of(
+    cell: Cell,
+    model: Model,
+    terms: Sequence[Term],
+    batches: Iterable[Batch],
+    device: torch.device,
+) -> Bench:
     def forward_of(batch: Batch) -> Callable[[], Pass]:
         def forward() -> Pass:
             outputs = model(batch)
@@ -116,7 +152,7 @@ def open_bench(granularity: str, device: torch.device) -> Bench:
     forwards = [forward_of(batch.to(device)) for batch in batches]
     alone = device.type == "cpu" and torch.get_num_threads() == 1
     clock = time.process_time if alone else time.perf_counter
-    return Bench(cell, model, method.terms, forwards, device, clock)
+    return Bench(cell, model, tuple(terms), forwards, device, clock)
 
 
 # --- steps ----------------------------------------------------------------------------------------

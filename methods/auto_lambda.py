@@ -29,6 +29,8 @@ class AutoLambda(LookAheadMethod):
         lr: of the Adam that moves lambda; 1e-4 in the paper on NYUv2, 3e-5 on Cityscapes.
     """
 
+    space = {"lr": {"log": [3e-5, 1e-3]}}
+
     weighted_heads = True
     lambda_T: Tensor
 

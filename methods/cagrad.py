@@ -26,6 +26,8 @@ class CAGrad(GradientMethod):
             LibMTL.
     """
 
+    space = {"c": {"uniform": [0.1, 0.9]}}
+
     def __init__(self, terms: Sequence[Term], seed: int = 0, c: float = 0.4):
         super().__init__(terms, seed)
         self.c = c

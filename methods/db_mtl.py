@@ -28,6 +28,8 @@ class DualBalancing(GradientMethod):
         decay: beta_k = beta / k^decay at step k; 0, or 0.5 in the paper's search.
     """
 
+    space = {"beta": [0.1, 0.5, 0.9], "decay": [0.0, 0.5]}
+
     needs = "jacobian"
     weighted_heads = True
     step: Tensor

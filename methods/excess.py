@@ -27,6 +27,8 @@ class ExcessMTL(GradientMethod):
             the built-in data has 100 steps each.
     """
 
+    space = {"eta": {"log": [0.01, 1.0]}}
+
     needs = "jacobian"
     weighted_heads = True
     replayable = True

@@ -24,6 +24,8 @@ class FairGrad(GradientMethod):
             delay; towards infinity, max-min. 1 in LibMTL.
     """
 
+    space = {"alpha": [1.0, 2.0]}
+
     weighted_heads = True
 
     def __init__(self, terms: Sequence[Term], seed: int = 0, alpha: float = 1.0):

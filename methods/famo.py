@@ -26,6 +26,8 @@ class Famo(LossMethod):
         decay: its weight decay gamma; 0.001 in the paper, which takes 0.01 on Cityscapes.
     """
 
+    space = {"decay": [0.001, 0.01]}
+
     reevaluates = True
     xi_T: Tensor
 

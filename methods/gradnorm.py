@@ -32,6 +32,8 @@ class GradNorm(GradientMethod):
         lr: of the Adam that moves w; 0.025 in the paper.
     """
 
+    space = {"alpha": {"uniform": [0.12, 1.5]}}
+
     weighted_heads = True
     weight_T: Tensor
     start_T: Tensor  # L_i(0); 0: not seen yet

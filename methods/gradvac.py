@@ -30,6 +30,8 @@ class GradVac(GradientMethod):
         beta: how fast the usual cosine follows; 0.01 in the paper.
     """
 
+    space = {"beta": {"log": [0.01, 0.5]}}
+
     phi_TT: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0, beta: float = 0.01):

@@ -2,11 +2,12 @@
 
 Source: Xiao, Dong, Zou, Ji, LDC-MTL: Balancing Multi-Task Learning through Scalable Loss
 Discrepancy Control, ArXiv 2025, arXiv:2502.08585, in its single-loop form, which descends both
-levels at once. Departures: the paper's router computes the weights from features; a loss-value
-method sees none, so its logits are learned by themselves. The paper penalises tasks that are
-neighbours in some order; here all pairs are, times 2 / K, which is the mean over all orders and the
-same for two tasks. A weight may become negative: that is the penalty's work. A loss that starts at
-0 is not divided.
+levels at once. Written from notes about the paper and reviews of it, not from its text, and held
+against no published number. Departures: the paper's router computes the weights from features; a
+loss-value method sees none, so its logits are learned by themselves. The paper penalises tasks that
+are neighbours in some order; here all pairs are, times 2 / K, which is the mean over all orders and
+the same for two tasks. A weight may become negative: that is the penalty's work. A loss that starts
+at 0 is not divided.
 """
 
 from collections.abc import Sequence
@@ -28,6 +29,8 @@ class LossDiscrepancyControl(LossMethod):
         tau: "one" or "weights" (tau = s); the paper takes either, by the data set.
         normalize: "start" (l as above) or "none" (l = L).
     """
+
+    space = {"lam": {"log": [0.01, 0.1]}}
 
     start_T: Tensor  # L_i(0); 0: not seen yet
 

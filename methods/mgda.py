@@ -26,6 +26,8 @@ class MGDA(GradientMethod):
             or "loss+" (both), as in the authors' code.
     """
 
+    space = {"normalize": ["none", "l2", "loss", "loss+"]}
+
     def __init__(self, terms: Sequence[Term], seed: int = 0, normalize: str = "none"):
         super().__init__(terms, seed)
         if normalize not in ("none", "l2", "loss", "loss+"):

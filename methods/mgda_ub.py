@@ -16,4 +16,6 @@ class MGDAUpperBound(MGDA):
         normalize: as in `mgda`.
     """
 
+    space = {"normalize": ["none", "l2", "loss", "loss+"]}
+
     needs = "representation"

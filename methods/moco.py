@@ -30,6 +30,8 @@ class MoCo(GradientMethod):
         scaled: track L_i g_i / ||g_i||.
     """
 
+    space = {"beta": {"uniform": [0.5, 0.99]}}
+
     needs = "jacobian"
     lambda_T: Tensor
     step: Tensor

@@ -26,6 +26,8 @@ class MoDo(CrossMethod):
         rho: pulls lambda towards equal weights; 0.1 in both; 0 is the bare algorithm.
     """
 
+    space = {"gamma": {"log": [0.001, 0.1]}}
+
     lambda_T: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0, gamma: float = 0.1, rho: float = 0.1):

@@ -1,10 +1,12 @@
 """SAMO: each gradient is taken where its own loss and the mean loss rise, for flat minima.
 
 Source: Ban, Subramani, Ji, SAMO: A Lightweight Sharpness-Aware Approach for Multi-Task Optimization
-with Joint Global-Local Perturbation, ICCV 2025, arXiv:2507.07883. Put it before a method that
-weighs gradients: `samo+mgda`; alone it is around the plain sum. A loss's own slope is estimated by
-two forward passes along a random direction and scaled to the mean gradient's length, tensor by
-tensor, so that of its size only the sign counts.
+with Joint Global-Local Perturbation, ICCV 2025, arXiv:2507.07883. Written from notes about the
+paper and reviews of it, not from its text, and held against no published number. Put it before a
+method that weighs gradients: `samo+mgda`; alone it is around the plain sum. A loss's own slope is
+estimated by two forward passes along a random direction and scaled to the mean gradient's length,
+tensor by tensor, so that of its size only the sign counts. Departures: what the notes
+leave open, such as a draw for each loss, is this file's reading.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,6 +33,8 @@ class SAMO(PerturbedMethod):
         mu: step of the estimate; 0.01 in the paper.
     """
 
+    space = {"rho": {"log": [0.01, 0.5]}, "alpha": {"uniform": [0.3, 0.7]}}
+
     def __init__(
         self,
         terms: Sequence[Term],
@@ -43,9 +47,6 @@ class SAMO(PerturbedMethod):
         if rho < 0 or not 0 <= alpha <= 1 or mu <= 0:
             raise ValueError(f"rho {rho}, alpha {alpha}, mu {mu}: >= 0, in 0 to 1, above 0")
         self.rho, self.alpha, self.mu = rho, alpha, mu
-
-    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
-        return self.inner.weights(G_KK, step)
 
     def shifts(
         self,

@@ -28,6 +28,8 @@ class SDMGrad(CrossMethod):
         lr, momentum, iterations: of the inner descent; 10 (LibMTL: 5), 0.5 and 20.
     """
 
+    space = {"lr": [5.0, 10.0]}
+
     w_T: Tensor
 
     def __init__(

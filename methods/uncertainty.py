@@ -22,6 +22,8 @@ class Uncertainty(LossMethod):
         init: every s_i at the start; 0 in the paper.
     """
 
+    space = {"init": [0.0, -0.5, -0.7]}
+
     tau_T: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0, init: float = 0.0):

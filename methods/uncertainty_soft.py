@@ -22,6 +22,8 @@ class UncertaintySoft(LossMethod):
         temperature: T. 1 / L of the built-in data's loss terms goes from 0.1 to 200, hence 100.
     """
 
+    space = {"temperature": {"log": [1.0, 1000.0]}}
+
     def __init__(self, terms: Sequence[Term], seed: int = 0, temperature: float = 100.0):
         super().__init__(terms, seed)
         if temperature <= 0:

@@ -15,6 +15,22 @@ from mtl_bench.core.config import Cell, load_recipe
 SHARED = Path(__file__).resolve().parents[2] / "shared"  # real samples; not in a public clone
 
 
+def pytest_collection_modifyitems(items):
+    """What needs a GPU is skipped without one; `gpu.sh --cpu-rehearsal` runs some of it all the
+    same."""
+    if torch.cuda.is_available() or "MTL_BENCH_REHEARSAL" in os.environ:
+        return
+    for item in items:
+        if item.get_closest_marker("cuda"):
+            item.add_marker(pytest.mark.skip(reason="needs a GPU"))
+
+
+@pytest.fixture
+def device() -> torch.device:
+    """Of a test marked `cuda`; the CPU in a rehearsal."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
 @pytest.fixture(autouse=True)
 def as_at_the_start():
     """Signals and threads are the process's own: what runs inside a test leaves them as they were.

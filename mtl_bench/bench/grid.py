@@ -31,6 +31,17 @@
     rows = "name"                   # or an axis
     control = "Halved"              # the line that every other is tested against
 
+    [tune]                          # trials of every line; see mtl_bench/bench/tuning.py
+    trials = 6
+    seeds = [100]                   # none of the grid's
+    [tune.space]                    # beside it, what each method declares; see bench/space.py
+    "recipe.optim.lr" = { log = ["0.1x", "10x"] }
+
+Several problems stand in place of `recipe`, each with its recipe's backbone where neither axes nor
+rows say one, or with settings of its own:
+
+    suite = ["a", "b", { recipe = "c", backbone = "d", "recipe.data.val_scenes" = 200 }]
+
 `method` and `backbone` stand in the axes or in every row; a file without [[row]] is the axes alone.
 Keys of a row: method, backbone, tasks, seed, video, single_task, granularity, pretrained, replay,
 recipe, recipe.SECTION.KEY, method.KEY, backbone.KEY. Under [baseline] a cell keeps recipe, backbone
@@ -70,9 +81,9 @@ device, recipe, backbone.KEY of the plug-in, weights.BACKBONE, quality.recipe. A
 engine does not have on the device is skipped.
 """
 
+import functools
 import itertools
 import math
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -90,6 +101,8 @@ from mtl_bench.bench.jobs import (
     load_cell,
     recipe_of,
 )
+from mtl_bench.bench.space import DEFAULT, TIMES, Tune, draws, times
+from mtl_bench.bench.space import check as check_space
 from mtl_bench.core import plugins, toml_file
 from mtl_bench.core.config import (
     Cell,
@@ -107,8 +120,8 @@ from mtl_bench.deploy import engines
 GRIDS = Path(__file__).parent / "grids"
 MOST = 10_000  # points of one grid: each takes a millisecond to look at, again and again
 MANY = 1000  # of which the number is said before
-TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
 SMOKE_STEPS = 6
+SMOKE_TRIALS = 2
 AXES = ("backbone", "size", "tasks", "engine", "precision")  # of timings
 Values: TypeAlias = Mapping[str, Any]
 FORMS: dict[type, str] = {
@@ -128,14 +141,14 @@ class Skip:
         return self.job
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grid:
     """A named set of jobs of one kind and how to tabulate them."""
 
     name: str  # of its folder in reports/; ends in -smoke for a smoke run
     question: str
     kind: Kind[Any]
-    recipe: Recipe | str  # of timings its name: whose network
+    recipe: Recipe | str  # of timings its name: whose network; of a suite all names
     axes: Mapping[str, tuple[Any, ...]]
     jobs: tuple[Any, ...]
     skips: tuple[Skip, ...] = ()
@@ -144,6 +157,7 @@ class Grid:
     names: Mapping[str, str] = field(default_factory=lambda: NOTHING)  # cell id -> its row's
     baseline: Values = field(default_factory=lambda: NOTHING)  # see baseline_cell
     quality: Values = field(default_factory=lambda: NOTHING)  # grid, recipe
+    tune: Tune | None = None  # see `tuning`
 
     @property
     def cells(self) -> tuple[Cell, ...]:
@@ -213,7 +227,8 @@ SHARED: dict[str, type] = {"kind": str, "question": str, "axes": dict, "skip": l
 KINDS: dict[str, tuple[Kind[Any], dict[str, type]]] = {  # a file's `kind` -> its keys
     "training": (
         CELLS,
-        {"recipe": str, "smoke_recipe": str, "row": list, "baseline": dict, "report": dict},
+        {"recipe": str, "smoke_recipe": str, "row": list, "baseline": dict, "report": dict}
+        | {"suite": list, "tune": dict},
     ),
     "latency": (TIMINGS, {"smoke": dict, "weights": dict, "quality": dict}),
 }
@@ -366,22 +381,28 @@ def _of_cells(
     say: Callable[[str], None],
 ) -> Grid:
     axes = _axes(file)
+    tune = _tune(file, smoke)
     if seeds is not None:
         if seeds < 1:
             raise ValueError(f"{seeds} seeds: at least 1 is needed")
         axes["seed"] = tuple(range(seeds))
-    _check_rows(file, axes)
+    elif smoke and tune is not None:
+        axes["seed"] = axes.get("seed", (0,))[:1]
+    suite = _suite(file, recipe)
+    _check_rows(file, axes, suite)
     key, otherwise = ("smoke_recipe", "smoke") if smoke else ("recipe", "small")
-    start = load_recipe(recipe or str(file.values.get(key, otherwise)))
-    start = _smoke_of(start) if smoke and recipe else start
-    if recipe and start.backbone:
+    first = next(iter(suite), None)
+    start = load_recipe(first or recipe or str(file.values.get(key, otherwise)))
+    start = _smoke_of(start) if smoke and (recipe or suite) else start
+    if recipe and start.backbone and not suite:
         settings = [f"backbone={start.backbone}", *settings]
     given = {setting.partition("=")[0].strip() for setting in settings}
     given |= {"recipe"} if smoke or recipe else set()
     axes = {axis: values for axis, values in axes.items() if axis not in given}
+    axes = {"recipe": tuple(suite), **axes} if suite else axes
     for row in file.values.get("row", []) if "recipe" in given else ():
         row.pop("recipe", None)
-    points = _CellPoints(file, Cell(start, "", "", pretrained=pretrained), settings)
+    points = _CellPoints(file, Cell(start, "", "", pretrained=pretrained), settings, suite, smoke)
     for index, rule in enumerate(file.values.get("skip", [])):
         for key, value in _values(rule).items():
             points.set(points.start, {key: value}, ("skip", index))
@@ -391,11 +412,88 @@ def _of_cells(
         axes,
         say,
         smoke=smoke,
-        recipe=points.start.recipe,
+        recipe=", ".join(suite) or points.start.recipe,
         baseline=MappingProxyType(baseline),
+        tune=tune,
     )
     points.set(points.start, baseline, ("baseline", 0))
+    if tune is not None and grid.jobs:
+        _check_tuned(points, grid, tune)
     return grid
+
+
+def _tune(file: TomlFile, smoke: bool) -> Tune | None:
+    """How lines are tuned, in short where it is a smoke run; None where they are not.
+
+    Raises:
+        ValueError: what [tune] cannot be, with its line.
+    """
+    values = file.values.get("tune")
+    if values is None:
+        return None
+    places = (("tune.space", 0), ("tune", 0))
+    for key, where in values.get("space", {}).items():
+        try:
+            check_space(key, where)
+        except ValueError as error:
+            raise file.error(str(error), key, *places) from error
+    try:
+        tune = from_dict(Tune, {"space": DEFAULT, **values}, "tune.")
+    except ValueError as error:
+        key = next((key for key in values if f"'{key}'" in str(error).replace("tune.", "")), "")
+        raise file.error(str(error), key, ("tune", 0)) from error
+    return (
+        replace(tune, trials=min(tune.trials, SMOKE_TRIALS), seeds=tune.seeds[:1])
+        if smoke
+        else tune
+    )
+
+
+def _check_tuned(points: "_CellPoints", grid: Grid, tune: Tune) -> None:
+    """Results have other seeds than trials and another split, and a trial can be set.
+
+    Raises:
+        ValueError: otherwise, with its line.
+    """
+    file = points.file
+    both = sorted({cell.seed for cell in grid.jobs}.intersection(tune.seeds))
+    if both:
+        message = f"seed {both[0]} is a result's, too: trials have seeds of their own"
+        raise file.error(message, "seeds", ("tune", 0))
+    for cell in grid.jobs:
+        if cell.recipe.evaluate.split != "test":
+            raise file.error(
+                f"trials are judged on the split val, and recipe {cell.recipe.name} reports its "
+                f"split {cell.recipe.evaluate.split}: set recipe.evaluate.split to test",
+                "trials",
+                ("tune", 0),
+            )
+    places = (("tune.space", 0), ("tune", 0))
+    try:
+        drawn = draws(tune, grid.jobs[0])[1:]
+    except ValueError as error:
+        key = next((key for key in tune.space if key in str(error)), "")
+        raise file.error(str(error), key, *places) from error
+    for values in drawn:
+        own = {key: value for key, value in values.items() if key in tune.space}
+        points.set(grid.jobs[0], own, *places)
+
+
+def _suite(file: TomlFile, recipe: str | None) -> dict[str, Values]:
+    """Recipe -> what the suite sets of its cells; of the one that was asked for, where one was.
+
+    Raises:
+        ValueError: an entry that is no recipe's name and no table with one.
+    """
+    found: dict[str, Values] = {}
+    for entry in file.values.get("suite", []):
+        values = dict(entry) if isinstance(entry, dict) else {"recipe": entry}
+        name = values.pop("recipe", None)
+        if not isinstance(name, str):
+            message = 'a suite lists recipes: "NAME" or { recipe = "NAME", KEY = VALUE }'
+            raise file.error(message, "suite", ("", 0))
+        found[name] = values
+    return {recipe: found.get(recipe, NOTHING)} if found and recipe else found
 
 
 def _smoke_of(recipe: Recipe) -> Recipe:
@@ -404,8 +502,9 @@ def _smoke_of(recipe: Recipe) -> Recipe:
     return replace(recipe, smoke=True, optim=optim, latency=Latency(passes=5, warmup=1))
 
 
-def _check_rows(file: TomlFile, axes: Values) -> None:
-    """Each has a name of its own and no axis in it; method and backbone are somewhere."""
+def _check_rows(file: TomlFile, axes: Values, suite: Values) -> None:
+    """Each has a name of its own and no axis in it; method and backbone are somewhere, the latter
+    of a suite in its recipes."""
     rows: list[Values] = file.values.get("row", [])
     names = [row.get("name") for row in rows]
     for index, (row, name) in enumerate(zip(rows, names, strict=True)):
@@ -419,7 +518,7 @@ def _check_rows(file: TomlFile, axes: Values) -> None:
                 raise file.error(f"'{key}' is an axis; it cannot stand in a row, too", key, place)
     for key in ("method", "backbone"):
         without = [index for index, row in enumerate(rows or [{}]) if key not in row]
-        if key not in axes and without:
+        if key not in axes and without and not (suite and key == "backbone"):
             raise file.error(f"'{key}' is missing", "name", ("row", without[0]), ("axes", 0))
 
 
@@ -428,6 +527,9 @@ class _CellPoints(Points):
     file: TomlFile
     start: Cell
     settings: Sequence[str]
+    suite: Mapping[str, Values] = field(default_factory=lambda: NOTHING)
+    smoke: bool = False
+    load: Callable[[str], Recipe] = field(default_factory=lambda: functools.cache(load_recipe))
 
     def make(self, values: dict[str, Any], row: int) -> Cell:
         """Its values, then `--set`, then what multiplies a number."""
@@ -435,13 +537,23 @@ class _CellPoints(Points):
         recipe = values.pop("recipe", None)
         if recipe is not None:
             try:
-                start = replace(start, recipe=load_recipe(str(recipe)), tasks=())
+                loaded = self.load(str(recipe))
             except ValueError as error:
                 raise self.file.error(str(error), "recipe", *places) from error
+            if recipe in self.suite:
+                loaded = _smoke_of(loaded) if self.smoke else loaded
+                values = {"backbone": loaded.backbone, **self.suite[recipe], **values}
+                places = (*places, ("", 0))
+            start = replace(start, recipe=loaded, tasks=())
         factors = {k: v for k, v in values.items() if isinstance(v, str) and TIMES.fullmatch(v)}
         plain = {key: value for key, value in values.items() if key not in factors}
         cell = override(self.set(start, plain, *places), self.settings)
-        return self.set(cell, {k: _times(cell, k, v) for k, v in factors.items()}, *places)
+        if not cell.backbone:
+            message = (
+                f'recipe {recipe} names no backbone: {{ recipe = "{recipe}", backbone = "NAME" }}'
+            )
+            raise self.file.error(message, "suite", ("", 0))
+        return self.set(cell, {k: times(cell, k, v) for k, v in factors.items()}, *places)
 
     def matches(self, rule: Values, job: Cell) -> bool:
         try:
@@ -460,17 +572,6 @@ class _CellPoints(Points):
                 except ValueError as own:
                     raise self.file.error(str(own), key, *places) from own
             raise self.file.error(str(error), "", *places) from error
-
-
-def _times(cell: Cell, key: str, factor: str) -> Any:
-    """A cell's number times 2 for "2x", whole where it is; the text where there is no number."""
-    number = to_dict(cell)
-    for part in key.split("."):
-        number = number.get(part) if isinstance(number, dict) else None
-    if type(number) not in (int, float):
-        return factor
-    product = float(factor[:-1]) * number
-    return round(product) if type(number) is int else product
 
 
 # --- timings --------------------------------------------------------------------------------------

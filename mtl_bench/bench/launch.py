@@ -10,9 +10,9 @@ that train in the same runs folder hold still meanwhile. `run_here` runs one cel
 
 import contextlib
 import json
+import math
 import os
 import signal
-import subprocess
 import time
 import traceback
 from abc import ABC, abstractmethod
@@ -24,19 +24,19 @@ from typing import Any, Protocol
 
 from mtl_bench.bench import store
 from mtl_bench.bench.data_state import Data
+from mtl_bench.bench.executors import Processes, Task
 from mtl_bench.bench.jobs import Job, Timing, kind_of, with_parents
 from mtl_bench.bench.jobs import lack as lack_of
-from mtl_bench.bench.preloaded import PROGRAM, Forked, can_fork
 from mtl_bench.bench.store import State
+from mtl_bench.core import locks
 from mtl_bench.core.config import Cell
 from mtl_bench.core.files import read_json, write_json
-from mtl_bench.core.locks import CLAIMED, LAUNCHER, SIDE_BY_SIDE, Quiet, claim, claimed_by
 from mtl_bench.core.plain import to_dict
 from mtl_bench.core.provenance import cores
 
 INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a job that was told to stop
 POLL_S = 0.2
-GRACE_S = 30.0  # for a cell to save its state after Ctrl-C
+ORDERED = "MTL_BENCH_ORDERED"  # set by who starts a cell only when what it needs is done
 
 CellCommand = Callable[[Cell], Sequence[str]]
 TimingCommand = Callable[[Timing, Path], Sequence[str]]  # a timing, and the file for its row
@@ -64,7 +64,7 @@ class Run(ABC):
     name: str = ""  # the grid's, where it has names
     began: float = field(default_factory=time.monotonic)
     progress: Mapping[str, Any] = field(default_factory=dict)  # of its `progress.json`
-    process: "subprocess.Popen[bytes] | Forked | None" = None
+    gpu: str | None = None  # that it has, as CUDA_VISIBLE_DEVICES names it
     _stage: tuple[str, int, float] = ("", 0, 0.0)  # name, first step seen, when
 
     @property
@@ -153,6 +153,7 @@ class CellRun(Run):
             store.clear(self.directory)
         renewed = rerun == state.word == "stale"
         self.directory.mkdir(parents=True, exist_ok=True)
+        locks.free(self.directory)  # which the cell's process would have to watch again
         for left_over in ("failed.json", "progress.json"):
             (self.directory / left_over).unlink(missing_ok=True)
         write_json(self.directory / "cell.json", to_dict(self.job))
@@ -201,8 +202,9 @@ class TimingRun(Run):
         self.log.unlink(missing_ok=True)
         claims = (path.parent for path in self.runs.glob("*/claim"))
         training = [path for path in claims if path != self.written.parent]
-        neighbours = any(claimed_by(path) is not None for path in training)
-        self._quiet.enter_context(Quiet(self.runs).alone(neighbours))
+        owners = filter(None, map(locks.claimed_by, training))
+        neighbours = any(locks.is_here(owner) for owner in owners)
+        self._quiet.enter_context(locks.Quiet(self.runs).alone(neighbours))
         return self.command(self.job, self.written)
 
     def ended(self, code: int) -> State:
@@ -236,6 +238,8 @@ class Launcher:
         lack: why a timing cannot be taken on this machine; then no process is started for it.
         smoke: stands in the rows of timings.
         data: those that cells run on.
+        gpus: that cells are spread over, see `gpu_pool`: one each, and several on one only where
+            there are more `jobs`. None: the processes see what this one sees.
     """
 
     runs: Path
@@ -247,11 +251,14 @@ class Launcher:
     lack: Callable[[Timing], str | None] = lack_of
     smoke: bool = False
     data: Data | None = None
+    gpus: Sequence[str] = ()
+    _processes: Processes = field(default_factory=Processes)
     _running: list[Run] = field(default_factory=list)
     _unsettled: set[str] = field(default_factory=set)  # ids whose jobs have not ended here yet
     _elsewhere: set[str] = field(default_factory=set)  # ids that another process was seen running
+    _remote: dict[str, float] = field(default_factory=dict)  # that of them on a machine, when last
+    _rows: dict[str, int] = field(default_factory=dict)  # of jobs that had one before: its time
     _states: dict[str, State] = field(default_factory=dict)
-    _began: float = field(default_factory=time.time)
 
     def run(self, todo: Sequence[Job]) -> dict[str, State]:
         """Run all; on Ctrl-C the running ones are told to save and stop.
@@ -264,8 +271,9 @@ class Launcher:
         """
         queue = deque(self._queued(job, n, len(todo)) for n, job in enumerate(todo, 1))
         self._unsettled = {job.id for job in todo}
+        self._rows = {job.id: self._row_time(job) for job in todo}
         timed = any(isinstance(job, Timing) for job in todo)
-        with claim(self.runs / "latency") if timed else contextlib.nullcontext():
+        with locks.claim(self.runs / "latency") if timed else contextlib.nullcontext():
             try:
                 while queue or self._running:
                     self._fill(queue)
@@ -294,10 +302,12 @@ class Launcher:
                 if run.job.id not in self._elsewhere:
                     self.display.say(f"{run.label}  is run by another process")
                 self._elsewhere.add(run.job.id)
+                if state.why == store.ELSEWHERE:
+                    self._remote[run.job.id] = time.monotonic()
                 waiting.append(run)
             elif self._settled_elsewhere(run, state):
                 self._end(run, state, "by another process")
-            elif self._must_wait(run):
+            elif self._must_wait(run) or self._not_shown_yet(run, state):
                 waiting.append(run)
             else:
                 self._start(run, state)
@@ -314,8 +324,18 @@ class Launcher:
         """Whether another process brought the job to an end since this launcher began."""
         if run.job.id in self._elsewhere:
             return state.word in ("done", "failed")
-        row = kind_of(run.job).row_file(run.job, self.runs)
-        return state.word == "done" and row.stat().st_mtime > self._began
+        return state.word == "done" and self._row_time(run.job) != self._rows[run.job.id]
+
+    def _not_shown_yet(self, run: Run, state: State) -> bool:
+        """Whether another machine, which has let go of the job, may have left a row that a shared
+        folder's cache does not show yet."""
+        let_go = not (store.run_dir(run.job, self.runs) / "claim").exists()
+        recently = time.monotonic() - self._remote.get(run.job.id, -math.inf) < store.SHOWN_S
+        return recently and let_go and state.word in ("missing", "interrupted")
+
+    def _row_time(self, job: Job) -> int:
+        row = kind_of(job).row_file(job, self.runs)
+        return row.stat().st_mtime_ns if row.is_file() else 0
 
     def _start(self, run: Run, state: State) -> None:
         run.began, run.progress = time.monotonic(), {}
@@ -324,33 +344,28 @@ class Launcher:
             self._end(run, settled)
             return
         command = run.prepare(state, self.rerun)
+        if self.gpus:
+            taken = [each.gpu for each in self._running]
+            run.gpu = min(self.gpus, key=taken.count)
         self._running.append(run)
-        environment = child_environment(self.jobs)
-        if isinstance(run, CellRun) and can_fork(command):
-            run.process = Forked(command[len(PROGRAM) :], run.log, environment)
-        else:
-            with run.log.open("ab") as log:
-                run.process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    env=environment,
-                    start_new_session=True,  # Ctrl-C reaches it once, through `_stop`
-                )
+        environment = child_environment(self.jobs, run.gpu)
+        task = Task(
+            run.job.id, command, run.log, environment=environment, fork=isinstance(run, CellRun)
+        )
+        self._processes.submit([task])
         self.display.started(run)
 
     def _reap(self, queue: deque[Run]) -> None:
+        states = self._processes.states()
         for run in list(self._running):
-            assert run.process is not None
             with contextlib.suppress(FileNotFoundError, json.JSONDecodeError):
                 run.see(json.loads((run.log.parent / "progress.json").read_text()))
-            code = run.process.poll()
+            code = states[run.job.id].code
             if code is None:
                 continue
             self._running.remove(run)
             run.release()
-            if code == CLAIMED:  # another launcher was faster
+            if code == locks.CLAIMED:  # another launcher was faster
                 self._elsewhere.add(run.job.id)
                 queue.append(run)
             else:
@@ -371,31 +386,48 @@ class Launcher:
         self.display.ended(run, "  ".join(words), ok)
 
     def _stop(self) -> None:
-        """Forward the interruption and wait; a second Ctrl-C or half a minute kills."""
-        processes = [run.process for run in self._running if run.process is not None]
-        for process in processes:
-            process.send_signal(signal.SIGINT)
+        """Forward the interruption and wait."""
         saving = sum(not isinstance(run.job, Timing) for run in self._running)
         if saving:
             self.display.say(f"stopping {saving} running cells; they save their state")
-        deadline = time.monotonic() + GRACE_S
-        try:
-            for process in processes:
-                process.wait(max(0.0, deadline - time.monotonic()))
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            for process in processes:
-                process.kill()
-                process.wait()
+        self._processes.cancel()
         for run in self._running:
             run.release()
 
 
-def child_environment(jobs: int) -> dict[str, str]:
+def queued_tasks(
+    todo: Sequence[Cell], runs: Path, command: CellCommand, rerun: str | None, data: Data | None
+) -> list[Task]:
+    """What a queue is given for cells that nobody runs, each with its place made ready."""
+    tasks = []
+    for cell in todo:
+        run = CellRun(1, 1, cell, runs, command=command, data=data)
+        words = run.prepare(store.inspect(cell, runs, data), rerun)
+        after = tuple(parent.id for parent in cell.parents)
+        tasks.append(Task(cell.id, words, run.log, after))
+    return tasks
+
+
+def gpu_pool(visible: str | None, count: int) -> tuple[str, ...]:
+    """The GPUs that this process sees, as CUDA_VISIBLE_DEVICES would name each.
+
+    Args:
+        visible: CUDA_VISIBLE_DEVICES; None: not set, and all are seen.
+        count: how many are seen. CUDA ends at the first name that it does not know.
+    """
+    names = map(str, range(count)) if visible is None else map(str.strip, visible.split(","))
+    return tuple(names)[:count]
+
+
+def child_environment(jobs: int, gpu: str | None = None) -> dict[str, str]:
     """Of a job's process; processes side by side share the cores instead of fighting for them."""
-    extra = {LAUNCHER: str(os.getpid()), "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
+    extra = {locks.LAUNCHER: json.dumps(locks.process()), ORDERED: "1"}
+    extra |= {"PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if jobs > 1:
         extra["OMP_NUM_THREADS"] = str(max(1, cores() // jobs))
-        extra[SIDE_BY_SIDE] = str(jobs)
+        extra[locks.SIDE_BY_SIDE] = str(jobs)
+    if gpu is not None:
+        extra["CUDA_VISIBLE_DEVICES"] = gpu
     return {**os.environ, **extra}
 
 
@@ -455,7 +487,8 @@ class Here:
         """
         for parent in with_parents(cell.parents):
             assert isinstance(parent, Cell)
-            state = store.inspect(parent, self.runs, store.data_for(parent, cell, self.data))
+            look = store.inspect_done if ORDERED in os.environ else store.inspect
+            state = look(parent, self.runs, store.data_for(parent, cell, self.data))
             if state.word == "stale" and not state.trained:
                 again = f"mtl-bench train {store.run_dir(parent, self.runs)}/cell.json --stale"
                 raise ValueError(f"a cell that this one needs is stale, {state.why}: {again}")
@@ -466,7 +499,9 @@ class Here:
 
     def _run(self, cell: Cell, rerun: bool, stale: bool) -> None:
         directory = store.run_dir(cell, self.runs)
-        with claim(directory):
+        if store.inspect(cell, self.runs).why == store.ELSEWHERE:
+            self.echo(f"{directory} is claimed {store.ELSEWHERE}: watching whether that one lives")
+        with locks.claim(directory):
             if rerun:
                 store.clear(directory)
             elif line := store.done_already(cell, self.runs, stale, self.data):

@@ -17,10 +17,8 @@ from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 
-from mtl_bench.core.locks import LAUNCHER
-
 PROGRAM = (sys.executable, "-m", "mtl_bench")
-MODULES = ("mtl_bench.cli.app", "mtl_bench.bench.run")
+MODULES = ("mtl_bench.cli.app", "mtl_bench.bench.run", "mtl_bench.bench.warmed")
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -102,7 +100,5 @@ def _run(words: list[str], log: str, environment: dict[str, str]) -> None:
     os.environ.update(environment)
     # What this was forked from lives as long as somebody holds this end: the launcher alone is to.
     os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]
-    if LAUNCHER in environment:
-        os.environ[LAUNCHER] = str(os.getppid())
     sys.argv = ["mtl-bench", *words]
     runpy.run_module("mtl_bench", run_name="__main__", alter_sys=True)

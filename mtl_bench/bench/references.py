@@ -65,7 +65,10 @@ def baselines(grid: Grid) -> tuple[Cell, ...]:
     if not grid.baseline:
         return ()
     skipped = {skip.job.id for skip in grid.skips}
-    found = {cell.id: cell for cell in (baseline_cell(c, grid.baseline) for c in grid.cells)}
+    alike = {
+        (c.recipe, c.backbone, str(c.backbone_args), c.pretrained, c.seed): c for c in grid.cells
+    }
+    found = {c.id: c for c in (baseline_cell(cell, grid.baseline) for cell in alike.values())}
     return tuple(cell for cell in found.values() if cell.id not in skipped)
 
 

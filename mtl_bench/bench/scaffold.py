@@ -29,6 +29,9 @@ class {title}(LossMethod):
         init: every s_i at the start. Arguments like this one are set with --set method.init=0.5.
     """
 
+    # What the trials of a tuned grid draw: these, or "log" or "uniform": [LOW, HIGH] in braces.
+    space = {{"init": [0.0, -0.5]}}
+
     def __init__(self, terms: Sequence[Term], seed: int = 0, init: float = 0.0):
         super().__init__(terms, seed)  # gives self.fixed_T, and self.generator to draw from
         # State that training changes is a parameter (learned) or a buffer: both are checkpointed.

@@ -22,6 +22,7 @@ runs/latency/                             of timings
 
 import shutil
 import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,15 +30,17 @@ from typing import Any
 
 from mtl_bench.bench.data_state import STAGES, Data
 from mtl_bench.bench.jobs import NOTHING, Job, Kind, kind_of, load_cell, with_parents
-from mtl_bench.core import provenance
+from mtl_bench.core import plugins, provenance
 from mtl_bench.core.config import Cell
 from mtl_bench.core.files import read_json, write_json
-from mtl_bench.core.locks import claimed_by
+from mtl_bench.core.locks import claimed_by, is_here
 from mtl_bench.core.plain import to_dict
 
 SECTIONS = ("metric", "protocol", "time", "code", "data", "env", "cell", "timing")  # of a row
 TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
 ASIDE = "set-aside-"
+ELSEWHERE = "on another machine"
+SHOWN_S = 60.0  # for a file that another machine has written to be seen on a shared folder
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
 
 
@@ -110,9 +113,23 @@ def inspect(job: Job, runs: Path, data: Data | None = None) -> State:
     Args:
         data: those that it would run on; a row of others is stale. None: not known.
     """
-    if claimed_by(run_dir(job, runs)) is not None:
-        return State("running")
+    if (owner := claimed_by(run_dir(job, runs))) is not None:
+        return State("running", "" if not owner or is_here(owner) else ELSEWHERE)
     return stored(job, runs, data)
+
+
+def inspect_done(job: Job, runs: Path, data: Data | None = None) -> State:
+    """As `inspect`, of a job that is known to be done: what a shared folder's cache does not show
+    yet is waited for."""
+    deadline = time.monotonic() + SHOWN_S
+    state = inspect(job, runs, data)
+    while state.word in ("missing", "interrupted", "running") and time.monotonic() < deadline:
+        time.sleep(0.5)
+        for folder in (runs, run_dir(job, runs)):
+            if folder.is_dir():
+                list(folder.iterdir())  # reading a folder asks the server what is in it
+        state = inspect(job, runs, data)
+    return state
 
 
 def stored(job: Job, runs: Path, data: Data | None = None) -> State:
@@ -171,6 +188,7 @@ def data_for(needed: Job, cell: Cell, data: Data | None) -> Data | None:
     return None if needed.id in [each.id for each in before] else data
 
 
+@plugins.listed_once()
 def rows(
     jobs: Iterable[Job],
     runs: Path,
@@ -206,6 +224,7 @@ def all_rows(runs: Path) -> list[dict[str, Any]]:
     return found
 
 
+@plugins.listed_once()
 def to_run(
     jobs: Iterable[Job], runs: Path, rerun: str | None = None, data: Data | None = None
 ) -> list[Job]:
@@ -231,6 +250,7 @@ def to_run(
     return [job for job in with_parents(filter(wanted, jobs)) if wanted(job)]
 
 
+@plugins.listed_once()
 def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None = None) -> str:
     """`done 3   failed 1`, and what to do about some of them."""
     states = [inspect(job, runs, data) for job in jobs]
@@ -241,6 +261,7 @@ def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None 
     return "   ".join(f"{word} {n}{hints.get(word, '')}" for word, n in counts.items() if n)
 
 
+@plugins.listed_once()
 def hours_to_run(todo: Sequence[Job], jobs: Iterable[Job], runs: Path) -> float | None:
     """Expected duration one after another, from those that are done; None where none is."""
     work = seconds = 0.0

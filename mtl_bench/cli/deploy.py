@@ -277,6 +277,8 @@ def _agreement(row: dict[str, Any]) -> str:
             words["0" + what] = f"{100 * value:.3f} % {what} pixels"
         elif measure == "max":
             words["1" + what] = f"{what} {value:.1g}"
+        elif measure == "rms":
+            words["3" + what] = f"{what} {value:.1g}"
         elif measure == "median_rel":
             most = row["metric"][f"agreement.{what}_max_rel"]
             words["2" + what] = f"{what} {value:.1g} (largest {most:.1g})"

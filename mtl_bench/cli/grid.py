@@ -1,7 +1,10 @@
 """`ablate`, `status` and `report`: a grid of cells or of timings."""
 
+import itertools
+import os
 import shlex
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -18,6 +21,11 @@ if TYPE_CHECKING:
     from mtl_bench.bench.grid import Grid
     from mtl_bench.bench.jobs import Job, Timing
     from mtl_bench.core.recipe import Recipe
+
+
+class On(StrEnum):
+    local = "local"
+    slurm = "slurm"
 
 
 class Rerun(StrEnum):
@@ -53,8 +61,8 @@ def ablate(
             "--jobs",
             metavar="N",
             min=1,
-            help="Cells at a time; they share the cores. Without it as many as there are cores, on "
-            "a GPU one.",
+            help="Cells at a time; they share the cores, and the GPUs that CUDA_VISIBLE_DEVICES "
+            "names. Without it one a GPU, or else one a core.",
             show_default=False,
         ),
     ] = None,
@@ -68,6 +76,22 @@ def ablate(
             show_default=False,
         ),
     ] = None,
+    where: Annotated[
+        On,
+        typer.Option(
+            "--on",
+            help="slurm: queue the cells, at most --jobs at a time, and return; see "
+            "docs/clusters.md.",
+        ),
+    ] = On.local,
+    slurm: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME=VALUE,...",
+            help="Options of sbatch, such as partition=gpu,time=4:00:00,gpus=1.",
+            show_default=False,
+        ),
+    ] = "",
     data: o.DataOption = None,
     runs: o.RunsOption = Path("runs"),
     reports: o.ReportsOption = Path("reports"),
@@ -85,13 +109,21 @@ def ablate(
     from mtl_bench.bench import references, store
     from mtl_bench.bench.data_state import Data
     from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.bench.slurm import options_of
 
+    sbatch = options_of(slurm)
+    if sbatch and where is not On.slurm:
+        raise ValueError("--slurm is for --on slurm")
     choice = Choice(grid, recipe, seeds, smoke, settings, pretrained)
     chosen = choice.load(device)
     if chosen.kind is not CELLS and (jobs or 1) > 1:
         raise ValueError(f"--jobs {jobs}: a latency is taken with nothing else of ours running")
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
+    if where is On.slurm and chosen.kind is not CELLS:
+        raise ValueError(
+            "--on slurm queues cells; latencies are taken on a machine that you choose"
+        )
     against = references.baselines(chosen)
     chosen.kind.check([*chosen.jobs, *against])
     if chosen.kind is CELLS and not dry_run:  # it imports pandas
@@ -99,30 +131,44 @@ def ablate(
 
         of_cells.check(chosen)
     given = Data(None if data is None else data.resolve())
-    todo = store.to_run([*chosen.jobs, *against], runs, rerun, given)
-    for job in [] if dry_run else todo:
+    phases = _phases(chosen, runs, rerun is not None, given)
+    first = _left(next(phases), runs, rerun, given)
+    for job in [] if dry_run else first:
         if isinstance(job, Cell):
             o.locate(job, data)  # a wrong folder is told at once
     if not quiet or dry_run:
-        _announce(chosen, todo, runs, given)
+        _announce(chosen, first, runs, rerun, given)
+    steps = itertools.chain([first], (_left(each, runs, rerun, given) for each in phases))
+    if where is On.slurm:
+        passed_on = ["--wandb", wandb.value, "--device", device.value, "--quiet"]
+        todo = next(filter(None, steps), [])
+        _queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run)
+        if chosen.tune and todo and not dry_run:
+            typer.echo("once they are done, the same command queues what follows from them")
+        return
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
         return
-    if todo:
-        jobs = jobs or _side_by_side(chosen, todo, device)
-        _run(chosen, todo, runs, data, given, ["--wandb", wandb.value], device, jobs, rerun, quiet)
+    ran = False
+    gpus = _gpus(chosen, device)
+    options = ["--wandb", wandb.value]
+    for todo in steps:
+        ran = ran or bool(todo)
+        if todo:
+            several = jobs or _side_by_side(chosen, todo, gpus)
+            _run(chosen, todo, runs, data, given, options, device, several, gpus, rerun, quiet)
     if chosen.kind is CELLS:
         references.measure_trivial(
-            chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=bool(todo)
+            chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=ran
         )
     rows = _rows(chosen, runs, given)
     page = _write(chosen, rows, runs, reports, choice.command)
     words = [row["status"] for row in rows]
-    behind = [store.status(cell, runs, given) for cell in against]
-    bad = any(word not in chosen.kind.good for word in [*words, *behind])
+    words += [] if chosen.tune else [store.status(cell, runs, given) for cell in against]
+    bad = any(word not in chosen.kind.good for word in words)
     if bad or not quiet:
-        done = sum(word in ("done", "stale") for word in words)
-        typer.echo(f"{done} of {len(words)} {chosen.kind.noun}s done; report: {page}")
+        done = sum(row["status"] in ("done", "stale") for row in rows)
+        typer.echo(f"{done} of {len(rows)} {chosen.kind.noun}s done; report: {page}")
     if bad:
         raise typer.Exit(1)
 
@@ -139,28 +185,36 @@ def status(
 ) -> None:
     """List a grid's cells: done, stale, failed, interrupted, running or missing.
 
-    Those that are in no row of the grid but needed by one are marked as such.
+    Those that are in no row of the grid but needed by one are marked as such. Of cells that are in
+    Slurm's queue stands what Slurm says.
     """
-    from mtl_bench.bench import references, store
+    from mtl_bench.bench import store
     from mtl_bench.bench.jobs import TIMINGS, with_parents
     from mtl_bench.core.locks import claimed_by
 
     chosen = Choice(grid, recipe, seeds, smoke, settings, pretrained).load()
-    own = {job.id for job in chosen.jobs}
-    every = with_parents([*chosen.jobs, *references.baselines(chosen)])
+    from mtl_bench.bench.slurm import Slurm
+
+    own, names = _named(chosen, runs)
+    every = with_parents(own)
+    known = {job.id for job in own} if chosen.tune else {job.id for job in chosen.jobs}
+    queue = Slurm(runs).states() if shutil.which("squeue") else {}
     lines = []
     for job in every:
         state = store.inspect(job, runs)
-        about = "  ".join(filter(None, (state.why, state.headline)))
+        queued = queue[job.id].about if job.id in queue and state.row is None else ""
+        about = "  ".join(filter(None, (state.why, state.headline, queued)))
         if isinstance(job, Cell):
-            name = chosen.names.get(job.id, "") if job.id in own else "(needed by another)"
-            named = [name] if chosen.names or len(every) > len(own) else []
+            name = names.get(job.id, "") if job.id in known else "(needed by another)"
+            named = [name] if names or len(every) > len(known) else []
             what = [*named, job.label, str(store.run_dir(job, runs))]
         else:
             what = [*job.words, job.id]
         lines.append([state.word, *what, about])
     for line in [*o.columns(lines), *_skipped(chosen), store.summary(chosen.kind, every, runs)]:
         typer.echo(line)
+    if chosen.tune:
+        _tell_parts(chosen, runs)
     owner = claimed_by(runs / "latency") if chosen.kind is TIMINGS else None
     if owner is not None:
         typer.echo(f"process {owner.get('pid', '?')} is timing now")
@@ -280,30 +334,104 @@ class Choice:
         return shlex.join(words)
 
 
-def _announce(grid: "Grid", todo: "Sequence[Job]", runs: Path, data: "Data") -> None:
-    from mtl_bench.bench import references, store
+def _phases(grid: "Grid", runs: Path, again: bool, data: "Data") -> "Iterator[Sequence[Job]]":
+    """What is run one after another: of a grid that is tuned, problem by problem, trials and then
+    the results that they choose.
+
+    Args:
+        again: trials that failed, too.
+    """
+    from mtl_bench.bench import references, tuning
+
+    if grid.tune is None:
+        yield [*grid.jobs, *references.baselines(grid)]
+        return
+    for problem in tuning.problems(grid):
+        yield tuning.part(grid, problem, runs, data).to_try(again)
+        yield [final.cell for final in tuning.finals(grid, runs, data, [problem])]
+
+
+def _left(jobs: "Sequence[Job]", runs: Path, rerun: str | None, data: "Data") -> "list[Job]":
+    from mtl_bench.bench import store
+
+    return store.to_run(jobs, runs, rerun, data)
+
+
+def _named(grid: "Grid", runs: Path) -> "tuple[list[Job], Mapping[str, str]]":
+    """The jobs that are known by now, and what a reader calls them."""
+    from mtl_bench.bench import references, tuning
+
+    if grid.tune is None:
+        return [*grid.jobs, *references.baselines(grid)], grid.names
+    found: dict[str, tuple[Job, str]] = {}
+    for trial in tuning.trials(grid):
+        name = f"{trial.line} on {trial.problem}, trial {trial.number}"
+        found.setdefault(trial.cell.id, (trial.cell, name))
+    for final in tuning.finals(grid, runs):
+        name = f"{final.line} on {final.problem}, trial {final.choice.trial.number} chosen"
+        found.setdefault(final.cell.id, (final.cell, name))
+    return [job for job, _ in found.values()], {id: name for id, (_, name) in found.items()}
+
+
+def _tell_parts(
+    grid: "Grid", runs: Path, rerun: str | None = None, data: "Data | None" = None
+) -> None:
+    """A line for each problem: how far its trials and results are, and the hours left."""
+    from mtl_bench.bench import store, tuning
+
+    for problem in tuning.problems(grid):
+        part = tuning.part(grid, problem, runs, data)
+        wanted = [*part.to_try(rerun is not None), *(each.cell for each in part.finals)]
+        todo = store.to_run(wanted, runs, rerun, data)
+        trials = store.summary(grid.kind, [each.trial.cell for each in part.trials], runs, data)
+        words = [f"  {problem}: trials: {trials}"]
+        finals = store.summary(grid.kind, [each.cell for each in part.finals], runs, data)
+        waiting = f"{len(part.open)} after their trials" if part.open else ""
+        words += ["results: " + "   ".join(filter(None, (finals, waiting)))]
+        hours = part.hours(todo, runs) if todo or part.open else 0.0
+        words += [
+            "hours left: not known, none is done"
+            if hours is None
+            else f"about {hours:.1f} hours left, one after another"
+        ]
+        typer.echo("; ".join(words))
+
+
+def _announce(
+    grid: "Grid", todo: "Sequence[Job]", runs: Path, rerun: str | None, data: "Data"
+) -> None:
+    from mtl_bench.bench import references, store, tuning
     from mtl_bench.bench.jobs import CELLS, with_parents
 
-    every = with_parents([*grid.jobs, *references.baselines(grid)])
     counts = {axis: len(values) for axis, values in grid.axes.items()}
     counts |= {"row": len(set(grid.names.values()))} if grid.names else {}
     product = " x ".join(f"{n} {a}{'s' * (n > 1 and a[-1] != 's')}" for a, n in counts.items())
+    typer.echo(f"{grid.name}: {grid.question}")
     if grid.kind is CELLS:
-        needed = len(every) - len(grid.jobs)
-        more = f" and {needed} that they need" if needed else ""
         about = " or ".join(dict.fromkeys(_told(job.recipe) for job in grid.jobs))
     else:
         first = grid.jobs[0]
-        more = f" of {first.passes} passes on {first.device}"
         about = f"network of recipe {first.recipe}"
-    typer.echo(f"{grid.name}: {grid.question}")
-    typer.echo(
-        f"{len(grid.jobs)} {grid.kind.noun}s{more} = {product}, less {len(grid.skips)} skipped; "
-        f"{about}"
-    )
-    hours = store.hours_to_run(todo, every, runs)
-    about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
-    typer.echo(f"  {store.summary(grid.kind, every, runs, data)}   to run {len(todo)}{about}")
+    if grid.tune is not None:
+        typer.echo(
+            f"{len(grid.jobs)} results = {product}, less {len(grid.skips)} skipped, and their "
+            f"baselines; before them {len(tuning.trials(grid))} trials: {grid.tune.trials} of "
+            f"every line on every problem, judged on the split {tuning.SPLIT}; {about}"
+        )
+        _tell_parts(grid, runs, rerun, data)
+    else:
+        every = with_parents([*grid.jobs, *references.baselines(grid)])
+        needed = len(every) - len(grid.jobs)
+        more = f" and {needed} that they need" if needed else ""
+        more = more if grid.kind is CELLS else f" of {first.passes} passes on {first.device}"
+        typer.echo(
+            f"{len(grid.jobs)} {grid.kind.noun}s{more} = {product}, less {len(grid.skips)} "
+            f"skipped; {about}"
+        )
+        hours = store.hours_to_run(todo, every, runs)
+        about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
+        done = store.summary(grid.kind, every, runs, data)
+        typer.echo(f"  {done}   to run {len(todo)}{about}")
     for line in _skipped(grid):
         typer.echo(line)
 
@@ -324,15 +452,29 @@ def _skipped(grid: "Grid") -> list[str]:
     return [f"  skipped {reasons.count(why)}: {why}" for why in dict.fromkeys(reasons)]
 
 
-def _side_by_side(grid: "Grid", todo: "Sequence[Job]", device: o.Device) -> int:
-    """A cell a core on the CPU, where two processes of one thread do more steps than one of two."""
-    from mtl_bench.bench.jobs import CELLS, kind_of
+def _gpus(grid: "Grid", device: o.Device) -> tuple[str, ...]:
+    """What cells are spread over; a timing takes the GPU that it would take in a terminal."""
+    from mtl_bench.bench.jobs import CELLS
+    from mtl_bench.bench.launch import gpu_pool
     from mtl_bench.core.device import choose_device
+
+    if grid.kind is not CELLS or choose_device(device.value).type != "cuda":
+        return ()
+    import torch
+
+    return gpu_pool(os.environ.get("CUDA_VISIBLE_DEVICES"), torch.cuda.device_count())
+
+
+def _side_by_side(grid: "Grid", todo: "Sequence[Job]", gpus: Sequence[str]) -> int:
+    """A cell a GPU. Without one a cell a core: two processes of one thread do more steps than one
+    of two."""
+    from mtl_bench.bench.jobs import CELLS, kind_of
     from mtl_bench.core.provenance import cores
 
-    if grid.kind is not CELLS or choose_device(device.value).type != "cpu":
+    if grid.kind is not CELLS:
         return 1
-    return min(cores(), sum(kind_of(job).work(job) > 0 for job in todo) or 1)
+    trained = sum(kind_of(job).work(job) > 0 for job in todo) or 1
+    return min(len(gpus) or cores(), trained)
 
 
 def _run(
@@ -344,6 +486,7 @@ def _run(
     options: list[str],
     device: o.Device,
     jobs: int,
+    gpus: Sequence[str],
     rerun: str | None,
     quiet: bool,
 ) -> None:
@@ -364,29 +507,82 @@ def _run(
 
     command = of_cell if grid.kind is kinds.CELLS else of_timing
     bars = grid.kind is kinds.CELLS  # which would draw while something is timed
+    names = _named(grid, runs)[1]
     with display.choose(len(todo), quiet, bars) as shown:
         launcher = Launcher(
-            runs, command, shown, jobs, rerun, grid.names, smoke=grid.smoke, data=given
+            runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given, gpus=gpus
         )
         launcher.run(todo)
 
 
+def _queue(
+    todo: "Sequence[Job]",
+    runs: Path,
+    data: Path | None,
+    given: "Data",
+    options: list[str],
+    sbatch: Mapping[str, str],
+    cap: int | None,
+    rerun: str | None,
+    dry_run: bool,
+) -> None:
+    """Hand what nobody runs or has queued to Slurm. What they train on is rendered before, once."""
+    from mtl_bench.bench import jobs as kinds
+    from mtl_bench.bench import launch, store
+    from mtl_bench.bench.executors import Task
+    from mtl_bench.bench.slurm import FOLDER, Slurm, arrays
+
+    queue = Slurm(runs, sbatch, cap)
+    states = {} if dry_run else queue.states()
+    busy = [cell for cell in todo if store.status(cell, runs) == "running"]
+    busy += [cell for cell in todo if cell.id in states and states[cell.id].word != "ended"]
+    cells = [cell for cell in todo if isinstance(cell, Cell) and cell not in busy]
+    if dry_run:
+        shape = [Task(cell.id, (), runs, tuple(each.id for each in cell.parents)) for cell in cells]
+        for number, array in enumerate(arrays(shape)):
+            typer.echo(queue.script(runs.resolve() / FOLDER / f"TOKEN{number}", len(array)))
+        typer.echo("nothing was queued (--dry-run)")
+        return
+    queue.check()  # before anything is made ready
+    roots = {cell.recipe.data: o.data_root(cell, data, quiet=True) for cell in cells}
+
+    def command(cell: Cell) -> list[str]:
+        return kinds.cell_command(cell, runs, roots[cell.recipe.data], options)
+
+    queue.submit(launch.queued_tasks(cells, runs, command, rerun, given))
+    numbers = " ".join(map(str, queue.submitted))
+    if busy:
+        typer.echo(f"{len(set(busy))} cells run or are queued already")
+    if cells:
+        typer.echo(
+            f"queued {len(cells)} cells as Slurm's jobs {numbers}; `status` shows them, "
+            f"`scancel {numbers}` ends them, and once they are done `report` writes the report"
+        )
+    else:
+        typer.echo("nothing to queue")
+
+
 def _rows(grid: "Grid", runs: Path, data: "Data | None" = None) -> list[dict[str, Any]]:
     """One row a job; of cells with their deltas to the stored row of their baseline."""
-    from mtl_bench.bench import references, store
+    from mtl_bench.bench import references, store, tuning
 
-    rows = store.rows(grid.jobs, runs, grid.names, data)
+    if grid.tune is None:
+        rows = store.rows(grid.jobs, runs, grid.names, data)
+    else:
+        rows, against = tuning.results(grid, runs, data)
     if not grid.baseline:
         return rows
     from mtl_bench.report.delta import with_delta
 
+    if grid.tune is not None:
+        return with_delta(rows, lambda row: against.get(row["cell_id"]))
     return with_delta(rows, lambda row: references.baseline_row(grid, row, runs))
 
 
 def _write(
     grid: "Grid", rows: list[dict[str, Any]], runs: Path, reports: Path, command: str
 ) -> Path:
-    from mtl_bench.bench import references
+    from mtl_bench.bench import references, tuning
     from mtl_bench.bench.jobs import CELLS
 
     out = reports / grid.name
@@ -394,7 +590,8 @@ def _write(
         from mtl_bench.report import grid as of_cells
 
         trivial = references.trivial(grid, runs)
-        return of_cells.build(grid, rows, out, runs_root=runs, baseline=trivial, command=command)
+        tried = tuning.tried(grid, runs) if grid.tune is not None else ()
+        return of_cells.build(grid, rows, out, runs, trivial, command, tried)
     from mtl_bench.report import latency as of_timings
 
     return of_timings.build(grid, rows, out, references.quality(grid, runs), command)

@@ -5,6 +5,7 @@ its file, too, be it `mtl_bench/core/method.py` or a helper beside the method.
 """
 
 import ast
+import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -211,6 +212,9 @@ def _section(card: Card) -> str:
     notes = [f"Source: <{card.url}>." if card.url else ""]
     notes += [f"Needs {', '.join((card.needs, *card.extras))}." if card.needs else ""]
     notes += [f"Hyper-parameters: {settings}." if settings else ""]
+    space = plugins.attributes("methods", card.about.name).get("space", {})
+    drawn = ", ".join(_code(f"{key} = {json.dumps(where)}") for key, where in space.items())
+    notes += [f"Trials draw {drawn}." if drawn else ""]
     return f"### {in_markdown(card.about.name)}\n\n{formula}\n{' '.join(filter(None, notes))}\n"
 
 

@@ -269,11 +269,17 @@ def leave_out_defaults(sections: dict[str, Any], kept: Collection[tuple[str, str
     Args:
         kept: those that such jobs have always had.
     """
-    defaults = to_dict(Recipe())
+    defaults = _defaults()
     for section, key in LATER:
         own = sections.get(section, {})
         if key in own and (section, key) not in kept and own[key] == defaults[section][key]:
             del own[key]
+
+
+@lru_cache
+def _defaults() -> dict[str, Any]:
+    values: dict[str, Any] = to_dict(Recipe())
+    return values
 
 
 def training_json(cell: Cell) -> str:

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -38,7 +37,7 @@ def replacing(path: Path, synced: bool = True) -> Iterator[BinaryIO]:
         synced: wait until the disk has it, which takes milliseconds; for what can be made again
             in no time, or is checked when it is read, that is not needed.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.urandom(6).hex()}.tmp")
     try:
         with temporary.open("wb") as file:
             yield file

@@ -23,7 +23,7 @@ always K = T), P shared parameters, flattened.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -55,7 +55,9 @@ class Method(nn.Module):
     replayable: bool  # whether every update is the sum of one batch's gradients by the weights that
     # it logs, which `replay` can then train with; unsaid: yes, but not where it needs a jacobian
     reevaluates = False  # True: `after_step` gets the batch's losses under the new parameters
-    space: Mapping[str, Any] = MappingProxyType({})  # hyper-parameters to tune, and their values
+    # Hyper-parameters that a grid's trials tune, and where their values lie: see bench/space.py
+    space: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    stage_members: ClassVar[dict[str, tuple[str, ...]]] = {"tune": ("space",)}
     fixed_T: Tensor
 
     def __init__(self, terms: Sequence[Term], seed: int = 0):
@@ -162,6 +164,8 @@ class LookAheadMethod(GradientMethod):
 class Wrapper(GradientMethod):
     """A gradient method around another: in `a+b`, what `a` makes of the weights of `b`.
 
+    Unless it says otherwise, nothing.
+
     Args:
         inner: what it is around where nothing is said.
     """
@@ -181,6 +185,9 @@ class Wrapper(GradientMethod):
             raise ValueError(f"{name} goes around methods that weigh one batch, not {other}")
         self.inner, self.needs, self.weighted_heads = inner, inner.needs, inner.weighted_heads
         return self
+
+    def weights(self, G_KK: Tensor, step: Step) -> Tensor:
+        return self.inner.weights(G_KK, step)
 
     def head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
         return self.inner.head_weights(weight_K, step)

@@ -24,7 +24,9 @@ import sys
 import traceback
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,6 +62,7 @@ GIVEN = (  # the harness fills these arguments in
     *("self", "terms", "seed", "strides", "size", "outputs", "pretrained"),
 )
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders are called by it
+ANY = "[!_.]*"  # matches the stems of plug-ins, and not those of what lies beside them
 NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
 IS_NAME = Rule(
     "a name of a-z, 0-9 and _",
@@ -71,6 +74,10 @@ IS_TASK = Rule(
 )
 TOLD = re.compile(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", re.MULTILINE)  # in a section Args
 PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
+
+_listed: ContextVar[dict[tuple[str, str], dict[str, list[Path]]] | None] = ContextVar(
+    "listed", default=None
+)
 
 
 @dataclass(frozen=True)
@@ -123,7 +130,8 @@ def path_of(kind: str, name: str) -> Path:
         ValueError: an unknown name, one that two files have, or what is no name.
     """
     name = stem_and_field(name)[0]
-    word, paths = kind[:-1], _candidates(kind).get(name)
+    word = kind[:-1]
+    paths = _candidates(kind, name if NAME.fullmatch(name) else ANY).get(name)
     if paths is None:
         raise ValueError(
             f"no {word} called '{name}'{did_you_mean(name, files(kind))}; "
@@ -141,11 +149,33 @@ def kinds_of(name: str) -> list[str]:
     return [kind for kind in KINDS if name in _candidates(kind)]
 
 
-def _candidates(kind: str) -> dict[str, list[Path]]:
+@contextlib.contextmanager
+def listed_once() -> Iterator[None]:
+    """Within, folders are listed once: for a walk over many jobs, each of which asks for some."""
+    outer = _listed.get()
+    token = _listed.set({} if outer is None else outer)
+    try:
+        yield
+    finally:
+        _listed.reset(token)
+
+
+def _candidates(kind: str, name: str = ANY) -> dict[str, list[Path]]:
+    """Files by name: at least of one name, whose other files need not be read, or of any."""
+    seen = _listed.get()
+    if seen is None:
+        return _found(kind, name)
+    key = kind, os.environ.get(VARIABLE, "")
+    if key not in seen:
+        seen[key] = _found(kind, ANY)
+    return seen[key]
+
+
+def _found(kind: str, name: str) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
-    paths = [path for folder in folders(kind) for path in _files_in(folder)]
+    paths = [path for folder in folders(kind) for path in _files_in(folder, name)]
     extra = (Path(p) for p in os.environ.get(VARIABLE, "").split(os.pathsep))
-    paths += [path for path in extra if path.is_file()]
+    paths += [path for path in extra if path.is_file() and fnmatchcase(name_of(path), name)]
     for path in dict.fromkeys(path.resolve() if path.is_file() else path for path in paths):
         if _kind_of(path) == kind:
             found.setdefault(name_of(path), []).append(path)
@@ -164,8 +194,8 @@ def stem_and_field(task: str) -> tuple[str, str]:
     return stem, field
 
 
-def _files_in(folder: Path) -> list[Path]:
-    return sorted([*folder.glob("[!_.]*.py"), *folder.glob("[!_.]*/__init__.py")])
+def _files_in(folder: Path, name: str) -> list[Path]:
+    return sorted([*folder.glob(f"{name}.py"), *folder.glob(f"{name}/__init__.py")])
 
 
 def name_of(path: Path) -> str:

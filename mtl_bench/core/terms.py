@@ -37,7 +37,8 @@ def gather(losses: Mapping[str, Tensor], terms: Sequence[Term]) -> dict[str, Ten
         here = [part for part in term.parts if part.name in losses]
         if here:
             weighted = [part.fixed_weight * losses[part.name] for part in here]
-            found[term.name] = torch.stack(weighted).sum()
+            several = len(weighted) > 1
+            found[term.name] = torch.stack(weighted).sum() if several else weighted[0]
         elif not term.parts and term.name in losses:
             found[term.name] = losses[term.name]
     return found

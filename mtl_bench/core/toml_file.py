@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 Place = tuple[str, int]  # a table's name and which of that name; ("", 0) is the part before tables
-HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z_][\w-]*)\s*\]{1,2}\s*(#.*)?")
+HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z_][\w.-]*)\s*\]{1,2}\s*(#.*)?")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ A run that starts at any step, in one process or several, therefore sees the sam
 
 import dataclasses
 import hashlib
+import signal
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from typing import Any
@@ -78,7 +79,8 @@ def _sizes(sample: Batch) -> dict[str, torch.Size]:
     return {name: value.shape for name, value in sample.fields.items()}
 
 
-Slot = tuple[int, int]  # index of a sample, seed of its augmentation
+# Index of a sample; what the seed of its augmentation is made of, where it has any
+Slot = tuple[int, tuple[str, int, int, int]]
 
 
 def _batch(samples: Samples, slots: list[Slot]) -> Batch:
@@ -93,7 +95,7 @@ def _batch(samples: Samples, slots: list[Slot]) -> Batch:
 
 
 def _drawn(samples: Samples, slots: list[Slot]) -> Iterator[Batch]:
-    return (samples.sample(index, Generator().manual_seed(seed)) for index, seed in slots)
+    return (samples.sample(index, Generator().manual_seed(_hash(*key))) for index, key in slots)
 
 
 def _from_workers(samples: Samples, steps: "_Steps", workers: int, pinned: bool) -> Iterator[Batch]:
@@ -104,7 +106,7 @@ def _from_workers(samples: Samples, steps: "_Steps", workers: int, pinned: bool)
         num_workers=workers,
         prefetch_factor=AHEAD,
         pin_memory=pinned,
-        worker_init_fn=_one_thread,
+        worker_init_fn=_begin_worker,
         generator=Generator(),  # else it draws a seed from the global one, which training uses
     )
     batches = iter(loader)
@@ -157,6 +159,13 @@ def _shared(count: int, like: Tensor) -> Tensor:
     return like.new_empty(0).set_(storage).view(count, *like.shape)
 
 
+def _begin_worker(worker: int) -> None:
+    """A queue sends its signals to every process of a cell; the main one alone answers them."""
+    for number in (signal.SIGTERM, signal.SIGUSR1):
+        signal.signal(number, signal.SIG_IGN)
+    _one_thread(worker)
+
+
 def _one_thread(worker: int) -> None:
     """As torch does in its workers: more threads than cores would fight over them.
 
@@ -180,8 +189,7 @@ class _Steps:
             first = position * self.batch_size
             indices = _order(self.samples, self.seed, epoch)[first : first + self.batch_size]
             yield [
-                (index, _hash("augment", self.seed, step, slot))
-                for slot, index in enumerate(indices)
+                (index, ("augment", self.seed, step, slot)) for slot, index in enumerate(indices)
             ]
             step += 1
 

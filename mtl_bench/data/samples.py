@@ -22,6 +22,9 @@ from mtl_bench.data.augment import augment
 
 Targets = Callable[[Batch], dict[str, Tensor]]
 
+# Of a data set that has none: what no task reads needs no value
+NO_CAMERA = Camera(torch.full((3, 3), torch.nan), *torch.full((2,), torch.nan))
+
 
 def open_samples(
     recipe: Recipe,
@@ -158,8 +161,7 @@ class Samples:
 
 
 def _camera(frame: DecodedFrame, K_33: Tensor | None) -> Camera:
-    """NaN throughout where the data set has none: what no task reads needs no value."""
     if K_33 is None:
-        return Camera(torch.full((3, 3), torch.nan), *torch.full((2,), torch.nan))
+        return NO_CAMERA
     height, pitch = frame.camera_height_m, frame.camera_pitch_rad
     return Camera(K_33, torch.tensor(height), torch.tensor(pitch))

@@ -49,6 +49,8 @@ class Scales(InMemory):
         self.pixels_N3HW, functions_NK = _made(self.functions, data, self.split)
         scale_K = data.norm_ratio ** np.linspace(-0.5, 0.5, data.heads)
         self.truth_NK = torch.from_numpy((functions_NK * scale_K).astype(np.float32))
+        columns = zip(names, self.truth_NK.split(1, dim=1), strict=False)
+        self.columns = {name: truth_N1 for name, truth_N1 in columns if name in self.needs}
         self.names = [f"{self.split}{number}" for number in range(len(self.truth_NK))]
 
     @staticmethod
@@ -62,10 +64,9 @@ class Scales(InMemory):
 
     def read(self, name: str) -> DecodedFrame:
         index = int(name.removeprefix(self.split))
-        numbers = dict(zip(self.predicts["regress"], self.truth_NK[index].split(1), strict=False))
         return DecodedFrame(
             images_N3HW=[self.pixels_N3HW[index]],
-            fields={key: value for key, value in numbers.items() if key in self.needs},
+            fields={name: truth_N1[index] for name, truth_N1 in self.columns.items()},
         )
 
 

@@ -29,6 +29,7 @@ LIMITS = {  # precision -> least share of equal ids' pixels, largest median of a
 # beyond the limit), bf16 0.08; red and blue exchanged, logits alone, 0.14 to 0.25.
 RANDOM = {"fp32": 1e-3, "fp16": 0.05, "bf16": 0.1}
 EQUAL, MEDIAN = "_equal", "_median_rel"  # ends of measures
+RMS = "agreement.maps_rms"
 
 
 @dataclass
@@ -38,6 +39,8 @@ class Agreement:
     infos: Mapping[str, MapInfo]  # by the maps' names
     maps_rms: float = 0.0  # of the map that differs most, over the plain map's standard deviation
     measures: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))  # by image
+    # Of maps that no ids or quantity of their task speak for: squares of differences, and of values
+    squares: dict[str, Tensor] = field(default_factory=dict)
 
     def update(
         self, plain: tuple[Maps, dict[str, Results]], other: tuple[Maps, dict[str, Results]]
@@ -47,13 +50,21 @@ class Agreement:
         What is not finite in `other` is never near to what is.
         """
         (maps_a, done_a), (maps_b, done_b) = plain, other
+        judged = {
+            task_of(name) for name, about in self.infos.items() if about.ids or about.quantity
+        }
         for name, about in self.infos.items():
-            a, b, task = maps_a[name], maps_b[name], name.partition(".")[0]
+            a, b, task = maps_a[name], maps_b[name], task_of(name)
             if b.shape != a.shape:
                 b = F.interpolate(b, a.shape[2:], mode="bilinear", align_corners=True)
             spread = a.std() if a.numel() > 1 else a.abs()  # one number has no deviation
             off_by = ((b - a) / spread.clamp(min=1e-9)).square().mean().sqrt()
             self.maps_rms = max(self.maps_rms, _largest(off_by))
+            if task not in judged:
+                own = torch.stack(
+                    [(b - a).double().square().sum(), a.double().square().sum()]
+                ).cpu()
+                self.squares[name] = self.squares.get(name, torch.zeros_like(own)) + own
             if about.ids:
                 ids_a, ids_b = done_a[task][about.ids], done_b[task][about.ids]
                 self.measures[f"{about.words}_max"].append(_largest(b - a))
@@ -65,10 +76,15 @@ class Agreement:
                 self.measures[f"{about.quantity}_max_rel"].append(_largest(off))
 
     def values(self) -> dict[str, float]:
-        """`agreement.*`: the mean share of equal pixels, the largest of all differences."""
-        return {
-            f"agreement.{key}": sum(found) / len(found) if key.endswith(EQUAL) else max(found)
-            for key, found in self.measures.items()
+        """`agreement.*`: the mean share of equal pixels, the largest of all differences; of maps
+        that only their values speak for, the largest relative root mean square over the images."""
+        apart = [
+            _largest((off / own.clamp(min=1e-18)).sqrt()) for off, own in self.squares.values()
+        ]
+        found = {RMS: max(apart)} if apart else {}
+        return found | {
+            f"agreement.{key}": sum(each) / len(each) if key.endswith(EQUAL) else max(each)
+            for key, each in self.measures.items()
         }
 
     def wrong(self, precision: str, trained: bool = True) -> str:
@@ -83,11 +99,18 @@ class Agreement:
             what = key.removeprefix("agreement.").partition("_")[0]
             if trained and key.endswith(EQUAL) and not value >= least:
                 faults.append(f"{100 * value:.2f} % equal {what} pixels (limit {100 * least:g} %)")
+            if trained and key == RMS and not value <= RANDOM[precision]:
+                faults.append(f"maps {value:.2g} of their size (limit {RANDOM[precision]})")
             if key.endswith(MEDIAN) and not value <= largest:
                 faults.append(f"median relative {what} difference {value:.2g} (limit {largest:g})")
         if not math.isfinite(sum(values.values())):
             faults.append("values that are not finite")
         return ", ".join(faults)
+
+
+def task_of(name: str) -> str:
+    """Of a map's flat name."""
+    return name.partition(".")[0]
 
 
 def equal_share(a_BHW: Tensor, b_BHW: Tensor) -> float:

@@ -88,8 +88,9 @@ def rehearse(model: Model, cell: config.Cell, root: Path, device: torch.device) 
     with evaluating(model), torch.inference_mode():
         for walk in open_walks(cell.recipe, model.tasks, root):
             for index in range(len(walk.samples)):
-                batch = collate([walk.samples.sample(index, None)])
+                sample = walk.samples.sample(index, None)
                 if index == 0:
+                    batch = collate([sample])
                     found = predict(model, batch.to(device), walk.tasks, true_size(batch))
                     for task, metric in walk.measured:
                         truth = frame_truth(task, batch, 0)

@@ -31,6 +31,13 @@ RELATIVE = (  # to the reference group's mean; the key is the other column's nam
     Column("step_x", "step_ms", "step", -1, 2, part="cost"),
     Column("train_peak_x", "train_peak_mib", "train peak", -1, 2, part="cost"),
 )
+OF_CONTROL = {  # figures of a grid with a control, the last two of one that is tuned
+    "forest": "Against the control",
+    "bands": "How far ranks go",
+    "profiles": "Performance profiles",
+    "budgets": "What a budget of tuning buys",
+    "tradeoff": "Trade-off of tasks, and the control's front",
+}
 ONLY = {  # what a grid that is about one thing shows
     "cost": ("step_ms", "step_x", "train_peak_mib", "train_peak_x"),
 }
@@ -71,8 +78,8 @@ def per_class() -> dict[str, Column]:
 def figures() -> dict[str, str]:
     """Stems of the figures that a grid's report may have -> their headings, in the page's order."""
     return {
+        **OF_CONTROL,
         **{f"{y.name}_{x.name}": against(y, x) for y, x in pairs()},
-        "forest": "Against the control",
         "samples": "Sample predictions",
         "extremes": "Worst and best frame of each row",
         **{stem: capital(f"{c.in_words} per class") for stem, c in per_class().items()},
@@ -100,7 +107,9 @@ def measured(row: Row, column: Column) -> float:
     """A row's value in the column's unit; NaN where it has none."""
     value = row.get("metric", {}).get(column.key)
     if value is None:
-        value = flatten(row).get(column.key)
+        value = row
+        for part in column.key.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
     return math.nan if value is None else float(value) * column.scale
 
 

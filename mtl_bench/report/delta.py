@@ -12,13 +12,14 @@ from mtl_bench.core import quality
 from mtl_bench.core.columns import Column
 from mtl_bench.evaluate.delta import delta_flat, delta_task, log_gain
 from mtl_bench.report.columns import Row
+from mtl_bench.report.statistics import by_recipe, recipe_of
 
 
 def counted(rows: Sequence[Row]) -> list[Column]:
     """The metrics that count: those of the tasks that some row has a metric of.
 
-    A row must have all of them, so that all rows of a grid are judged by the same ones. A grid of
-    one task has none: there is nothing to trade.
+    A row must have all of them, so that all rows of a recipe are judged by the same ones. A recipe
+    of one task has none: there is nothing to trade.
     """
     metrics = [column for column in quality.quality() if column.in_delta]
     found = {c.task for c in metrics if any(_has(row, c) for row in rows)}
@@ -37,10 +38,10 @@ def with_delta(
     where only the baseline's code is older or only one of the two is a smoke run.
 
     Args:
-        metrics: what counts; none: what the tasks declare.
+        metrics: what counts; none: what the tasks of the row's recipe declare.
     """
-    metrics = metrics or counted(rows)
-    return [_with_delta(row, baseline_of(row), metrics) for row in rows]
+    of = {name: metrics or counted(several) for name, several in by_recipe(rows).items()}
+    return [_with_delta(row, baseline_of(row), of[recipe_of(row)]) for row in rows]
 
 
 def with_single_task_delta(

@@ -1,13 +1,15 @@
-"""What paired runs say about lines of a table: intervals, tests, verdicts, aggregates.
+"""What paired runs say about lines of a table: intervals, tests, verdicts, aggregates, ranks.
 
 A score is a number per line, problem and seed, of which more is better: the log gain, in points.
 A block is a problem and a seed; lines are compared within blocks, since the seed fixes data order
 and initial weights for all of them.
 
-Shapes: L lines, M problems, N seeds, B blocks, R runs, S sign patterns or resamples. NaN is a run
-that is missing, -inf a run that failed: it is the worst that can be, and is never dropped.
+Shapes: L lines, M problems, N seeds, B blocks, R runs, S sign patterns or resamples, K tasks, F
+points of a front, T trials. NaN is a run that is missing, -inf a run that failed: it is the worst
+that can be, and is never dropped.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,6 +22,7 @@ LEVEL = 0.95
 MARGIN = 1.0  # points of gain within which two lines are called equivalent
 FLIPS = 2**16  # sign patterns: all of them up to 16 blocks, as many random ones above
 RESAMPLES = 10_000
+AT_A_TIME = 500  # resamples in memory
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Comparison:
     ahead: bool  # the mean difference, failed runs clipped, is above 0
     within: bool  # the 90 % interval lies inside the margin
     superior: float  # share of blocks in which the line is ahead, ties half
-    p: float  # sign-flip test, two-sided
+    p: float  # two-sided
     p_holm: float  # over the declared family
     blocks: int
     failed: int  # blocks of these in which one of the two failed, or both
@@ -107,7 +110,8 @@ def bootstrap(
     differences between lines keep their pairing. With five seeds a problem a nominal 95 % covers
     about 91 %: `tests/report/test_evidence.py` measures it.
     """
-    drawn_SL = np.stack([aggregate(scores) for scores in resampled(score_LMN, resamples, seed)])
+    drawn = resampled(score_LMN, resamples, seed)
+    drawn_SL = np.concatenate([aggregate(score_SLMN) for score_SLMN in drawn])
     tails = [50 * (1 - level), 50 * (1 + level)]
     ends = np.percentile(drawn_SL, tails, axis=0, method="inverted_cdf")
     found = zip(aggregate(score_LMN), *ends, strict=True)
@@ -115,22 +119,27 @@ def bootstrap(
 
 
 def resampled(score_LMN: Array, resamples: int, seed: int) -> Iterator[Array]:
-    """Scores with the seeds of each problem drawn anew, jointly for all lines."""
+    """Scores with the seeds of each problem drawn anew, jointly for all lines: [S, L, M, N]s."""
     _, problems, seeds = score_LMN.shape
     draws = np.random.default_rng(seed).integers(seeds, size=(resamples, 1, problems, seeds))
-    return (np.take_along_axis(score_LMN, draw, axis=2) for draw in draws)
+    for start in range(0, resamples, AT_A_TIME):
+        yield np.take_along_axis(score_LMN[None], draws[start : start + AT_A_TIME], axis=3)
 
 
 # --- tests and verdicts ---------------------------------------------------------------------------
 
 
 def compare(
-    score_LMN: Array, control_MN: Array, margin: float = MARGIN, seed: int = 0
+    score_LMN: Array,
+    control_MN: Array,
+    test: Callable[[Array], float] | None = None,
+    margin: float = MARGIN,
 ) -> list[Comparison]:
     """Every line against one control; the lines are the family of Holm's correction.
 
     Args:
         score_LMN: the control is none of them.
+        test: two-sided p of the differences by block; None: `sign_flip`.
         margin: of equivalence, in points of the score.
     """
     found = []
@@ -146,7 +155,7 @@ def compare(
                 ahead=bool(clipped(d_B).sum() > 0),
                 within=-margin < narrow.low and narrow.high < margin,
                 superior=superiority(d_B),
-                p=sign_flip(d_B, seed),
+                p=(test or sign_flip)(d_B),
                 p_holm=np.nan,
                 blocks=len(d_B),
                 failed=int(np.isinf(apart_MN).sum()),
@@ -154,6 +163,17 @@ def compare(
         )
     corrected = holm([each.p for each in found])
     return [replace(each, p_holm=p) for each, p in zip(found, corrected, strict=True)]
+
+
+def ahead(value_LN: Array, control_N: Array) -> list[bool]:
+    """Which lines lead a control in one problem: the paired difference's interval is above 0, and
+    its p, by Holm over the lines, at most 1 - LEVEL."""
+    differences = [difference(value_N, control_N) for value_N in value_LN]
+    known = [d_N[~np.isnan(d_N)] for d_N in differences]
+    corrected = holm([student(d_B) for d_B in known])
+    return [
+        bool(p <= 1 - LEVEL and d_B.mean() > 0) for p, d_B in zip(corrected, known, strict=True)
+    ]
 
 
 def difference(x: Array, y: Array) -> Array:
@@ -169,21 +189,36 @@ def clipped(d_B: Array) -> Array:
     return np.clip(d_B, -bound, bound)
 
 
-def sign_flip(d_B: Array, seed: int = 0) -> float:
+def sign_flip(d_B: Array) -> float:
     """Two-sided p of a mean of 0 for paired differences: the share of sign patterns whose mean is
     as far from 0. It is exact up to 16 blocks, and takes FLIPS random patterns above."""
     blocks = len(d_B)
     if not blocks:
         return np.nan
-    exact = 2**blocks <= FLIPS
-    if exact:
-        bits_SB = np.arange(2**blocks)[:, None] >> np.arange(blocks) & 1
-    else:
-        bits_SB = np.random.default_rng(seed).integers(2, size=(FLIPS, blocks))
     d_B = clipped(d_B)
     observed = abs(d_B.sum()) * (1 - 1e-12)  # its own pattern counts, whatever the rounding
-    as_far = int((np.abs((1 - 2 * bits_SB) @ d_B) >= observed).sum())
-    return as_far / 2**blocks if exact else (as_far + 1) / (FLIPS + 1)
+    as_far = int((np.abs(_signs(blocks) @ d_B) >= observed).sum())
+    return as_far / 2**blocks if 2**blocks <= FLIPS else (as_far + 1) / (FLIPS + 1)
+
+
+@functools.lru_cache(maxsize=4)  # lines of a table have the same number of blocks
+def _signs(blocks: int) -> Array:
+    """Sign patterns, [S, B]."""
+    if 2**blocks <= FLIPS:
+        bits_SB = np.arange(2**blocks)[:, None] >> np.arange(blocks) & 1
+    else:
+        bits_SB = np.random.default_rng(0).integers(2, size=(FLIPS, blocks))
+    return np.where(bits_SB == 1, -1.0, 1.0)
+
+
+def student(d_B: Array) -> float:
+    """Two-sided p of a mean of 0 for the paired differences of one problem, by Student's test: it
+    fits `stratified_t`. NaN for fewer than two, and where one of a pair failed."""
+    if len(d_B) < 2 or not np.isfinite(d_B).all():
+        return np.nan
+    if np.ptp(d_B) <= 1e-9 * np.abs(d_B).max():  # what is the same for all seeds, such as a size
+        return 0.0 if d_B.any() else 1.0
+    return float(stats.ttest_1samp(d_B, 0).pvalue)
 
 
 def holm(p_L: Sequence[float]) -> list[float]:
@@ -200,3 +235,84 @@ def holm(p_L: Sequence[float]) -> list[float]:
 def superiority(d_B: Array) -> float:
     """Share of blocks in which a line is ahead, ties half: P(X > Y), paired."""
     return float(np.mean((np.sign(d_B) + 1) / 2)) if len(d_B) else np.nan
+
+
+# --- the suite as a whole -------------------------------------------------------------------------
+
+
+def profile(score_MN: Array, tau_T: Array) -> Array:
+    """Share of runs whose score is above each threshold. Source: Agarwal et al., NeurIPS 2021."""
+    known = score_MN[~np.isnan(score_MN)]
+    return np.array([(known > tau).mean() if len(known) else np.nan for tau in tau_T])
+
+
+def expected_best(score_T: Array) -> Array:
+    """Expected score of the best of n trials, for n from 1 to all that there are.
+
+    Source: Dodge et al., EMNLP 2019: one set of finished trials gives every smaller budget, drawn
+    from them with replacement.
+
+    Args:
+        score_T: finite.
+    """
+    trials = len(score_T)
+    share = np.arange(trials + 1) / trials
+    budget_T = np.arange(1, trials + 1)[:, None]
+    weight_TT = share[1:] ** budget_T - share[:-1] ** budget_T
+    found: Array = weight_TT @ np.sort(score_T)
+    return found
+
+
+def behind_front(point_K: Array, front_FK: Array) -> float:
+    """How far a point must improve in every task not to be dominated by a front; 0 or less: it is
+    on the front or beyond it (the additive epsilon indicator)."""
+    return float(np.max(np.min(front_FK - point_K, axis=1)))
+
+
+def ranks(score_XL: Array) -> Array:
+    """Ranks along the last dimension, 1 the best; equal ones share the mean of their ranks, and a
+    NaN has none."""
+    return np.asarray(stats.rankdata(-score_XL, axis=-1, nan_policy="omit"), float)
+
+
+def suite_mean(score_XMN: Array) -> Array:
+    """Mean over problems of the mean over seeds; NaN for a line that lacks a problem."""
+    known = ~np.isnan(score_XMN)
+    with np.errstate(invalid="ignore"):
+        mean_XM = np.where(known, score_XMN, 0).sum(-1) / known.sum(-1)
+    found: Array = mean_XM.mean(-1)
+    return found
+
+
+def rank_bands(
+    definitions: Sequence[Array], resamples: int = 1000, seed: int = 0
+) -> tuple[Array, Array]:
+    """Best and worst rank of each line, [L, 2]: over choices that a report makes, and over seeds.
+
+    The choices are how a score is defined and which problem is left out. Of the ranks under
+    resampled seeds, drawn jointly for all lines, the band is the middle LEVEL.
+
+    Args:
+        definitions: scores of the same runs, [L, M, N] each; the first is resampled.
+    """
+    problems = definitions[0].shape[1]
+    chosen = [suite_mean(score_LMN) for score_LMN in definitions]
+    if problems > 1:
+        left_out = (np.delete(s, m, axis=1) for s in definitions for m in range(problems))
+        chosen += [suite_mean(score_LMN) for score_LMN in left_out]
+    drawn = resampled(definitions[0], resamples, seed)
+    drawn_SL = np.concatenate([suite_mean(score_SLMN) for score_SLMN in drawn])
+    tails = [50 * (1 - LEVEL), 50 * (1 + LEVEL)]
+    return (
+        _ends(ranks(np.stack(chosen)), [0, 100]),
+        _ends(ranks(drawn_SL), tails),
+    )
+
+
+def _ends(rank_VL: Array, tails: Sequence[float]) -> Array:
+    """Percentiles of each line's ranks; NaN for a line that never has one."""
+    found = [
+        np.percentile(known, tails, method="inverted_cdf") if len(known) else [np.nan, np.nan]
+        for known in (rank_V[~np.isnan(rank_V)] for rank_V in rank_VL.T)
+    ]
+    return np.array(found)

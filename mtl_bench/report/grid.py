@@ -3,6 +3,7 @@
 Cells of different status never share a line, and neither do measured, trivial and published values.
 """
 
+import itertools
 import tomllib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,24 +13,37 @@ from typing import Any
 import pandas as pd
 from markupsafe import Markup
 
+from mtl_bench.bench.tuning import Tried
 from mtl_bench.core import quality
 from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
 from mtl_bench.core.style import MANY
 from mtl_bench.report import columns as known
-from mtl_bench.report import curves, pictures, plots, protocol
-from mtl_bench.report.columns import DELTA, ONLY, RELATIVE, Row, headlines, pairs, per_class, text
+from mtl_bench.report import curves, pictures, plots, protocol, trials, tuned, verdict_plots
+from mtl_bench.report.columns import (
+    DELTA,
+    ONLY,
+    RELATIVE,
+    Row,
+    capital,
+    headlines,
+    pairs,
+    per_class,
+    text,
+)
 from mtl_bench.report.delta import counted
-from mtl_bench.report.page import PAGE, Page, beside, figures_of, render
+from mtl_bench.report.page import PAGE, Figure, Page, beside, figures_of, render
 from mtl_bench.report.statistics import (
     SHOWN,
     SMOKE,
     Group,
     axes_of,
+    by_recipe,
     cell_of,
     grouped,
     kept,
+    tested,
     trivial_group,
 )
 from mtl_bench.report.table import (
@@ -47,11 +61,12 @@ from mtl_bench.report.table import (
     single,
     write,
 )
-from mtl_bench.report.verdicts import Verdicts, forest, judge, notes, section, untested
+from mtl_bench.report.verdicts import Verdicts, judge, notes, records, sections, untested
 from mtl_bench.train.curve import read as read_curve
 
 PUBLISHED = Path(__file__).parent / "literature.toml"
 AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
+VERDICTS, TRIALS = "verdicts", "trials"  # stems of their files
 WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples", "extremes")
 TRAINED_BRIEFLY = "Cells marked smoke were trained for a few steps to show that the pipeline works."
 NUMERALS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
@@ -137,6 +152,8 @@ class Results:
     published: tuple[Mapping[str, Any], ...]
     all_columns: tuple[Column, ...]
     reference: str | None = None  # the line that some columns are relative to
+    control: str | None = None  # the line that those in bold lead by a test
+    problem: str = ""  # the recipe, of a grid with several
 
     @property
     def lines(self) -> tuple[Group, ...]:
@@ -166,7 +183,10 @@ class Results:
 
 
 def tabulate(
-    rows: Sequence[Row], layout: Layout | None = None, baseline: Row | None = None
+    rows: Sequence[Row],
+    layout: Layout | None = None,
+    baseline: Row | None = None,
+    problem: str = "",
 ) -> Results:
     """Group rows by everything but the seed, and say which group leads each column.
 
@@ -175,13 +195,15 @@ def tabulate(
         layout: which field of a cell names a line (others join it where they differ), which
             columns there are and how they are ordered.
         baseline: metrics of the trivial predictor.
+        problem: the recipe's name where the grid has several, and these are the rows of one.
     """
     layout = layout or Layout()
     axes = axes_of([row for row in rows if row.get("status", "done") in SHOWN], layout.rows)
     trivial = None if baseline is None or layout.only else trivial_group(baseline, axes)
+    groups = grouped(rows, axes, trivial, layout.reference, layout.control)
     return Results(
         axes=axes,
-        groups=tuple(grouped(rows, axes, trivial, layout.reference)),
+        groups=tuple(groups),
         baseline=trivial,
         unfinished=tuple(
             _unfinished(r, axes) for r in rows if r.get("status", "done") not in SHOWN
@@ -189,7 +211,17 @@ def tabulate(
         published=published(layout.rows, {text(cell_of(row).get(layout.rows)) for row in rows}),
         all_columns=_columns(layout),
         reference=layout.reference,
+        control=layout.control if tested(groups, axes, layout.control) else None,
+        problem=problem,
     )
+
+
+def by_problem(rows: Sequence[Row], layout: Layout) -> dict[str, list[Row]]:
+    """The rows of each recipe of a suite, in which lines recur; those of another grid under ""."""
+    recipes = by_recipe(rows)
+    lines = [{text(cell_of(row).get(layout.rows)) for row in own} for own in recipes.values()]
+    recur = any(a & b for a, b in itertools.combinations(lines, 2))
+    return recipes if recur and layout.rows != "recipe.name" else {"": list(rows)}
 
 
 def published(axis: str, names: Iterable[str]) -> tuple[Mapping[str, Any], ...]:
@@ -248,9 +280,15 @@ def fill(results: Results, short: bool = False) -> Table:
     lacking = [TableRow.of(c.label, c.status, c.reason, c.slug) for c in results.unfinished]
     why = Head("why", left=True, css=WRAP), Head("folder", left=True, page_only=True)
     heads = (*Head.words("cell", "status"), *why)
+    of = f"{results.problem}: " * bool(results.problem)
     return Table(
         sections=tuple(
-            _section(results, heading, columns, f"{banner} {heading}.{said.get(heading, '')}")
+            _section(
+                results,
+                capital(of + heading.lower()) if of else heading,
+                columns,
+                f"{banner} {of}{heading}.{said.get(heading, '')}",
+            )
             for heading, columns in ([("", main)] if short and main else parts_of(results))
         ),
         notes=notes,
@@ -258,6 +296,20 @@ def fill(results: Results, short: bool = False) -> Table:
         lacking=Section.lacking("Cells", heads, lacking),
         published=tuple(_published(source, results.axes[0]) for source in results.published),
         banner=banner,
+    )
+
+
+def together(tables: Sequence[Table]) -> Table:
+    """Those of a suite's problems as one."""
+    lacking = [section for table in tables for section in table.lacking]
+    lines = tuple(line for section in lacking for line in section.lines)
+    return Table(
+        sections=tuple(section for table in tables for section in table.sections),
+        notes=tuple(dict.fromkeys(note for table in tables for note in table.notes)),
+        records=tuple(record for table in tables for record in table.records),
+        lacking=(replace(lacking[0], lines=lines),) if lacking else (),
+        published=tuple(section for table in tables for section in table.published),
+        banner=next((table.banner for table in tables if table.banner), ""),
     )
 
 
@@ -309,24 +361,24 @@ def _published(source: Mapping[str, Any], axis: str) -> Section:
 
 def _records(results: Results) -> Iterator[dict[str, Any]]:
     """A line per group: identity, kind, n, then mean and deviation of every column."""
+    every = known.columns()
+    of = {"recipe.name": results.problem} if results.problem else {}
     for group in results.lines:
-        named = dict(zip(results.axes, group.identity, strict=True))
+        named = dict(zip(results.axes, group.identity, strict=True)) | of
         kind = "trivial" if group.status == "trivial" else "measured"
         named |= {"kind": kind, "mark": group.mark, "n": str(len(group.rows))}
         relative = RELATIVE if results.reference is not None else ()
         yield (
-            named
-            | numbers(group.entries, known.columns())
-            | numbers(group.entries, relative, spread=False)
+            named | numbers(group.entries, every) | numbers(group.entries, relative, spread=False)
         )
     for source in results.published:
         for row in source["rows"]:
             named = {results.axes[0]: row["name"], "kind": "published", "mark": source["mark"]}
-            found = [c for c in known.columns() if c.headline and c.name in row]
+            found = [c for c in every if c.headline and c.name in row]
             found.sort(key=lambda c: bool(c.note))  # papers do not say what a note says of ours
             yield named | {c.name + "_published" * bool(c.note): row[c.name] for c in found}
     for cell in results.unfinished:
-        named = {results.axes[0]: cell.label, "kind": cell.status, "mark": cell.reason}
+        named = {results.axes[0]: cell.label, **of, "kind": cell.status, "mark": cell.reason}
         yield named | {"n": "0"}
 
 
@@ -336,7 +388,13 @@ def _records(results: Results) -> Iterator[dict[str, Any]]:
 def footnotes(results: Results) -> Iterator[str]:
     """One sentence or two for each thing that occurs in the table; `+-` stands for the sign."""
     groups = results.groups
-    if any(len(group.rows) > 1 for group in groups):
+    if results.control is not None:
+        yield (
+            f"Mean +- sample standard deviation over n seeds. Bold: ahead of {results.control}, by "
+            "differences paired by seed: their 95 % interval is on the better side of 0, and p is "
+            "at most 0.05 by Holm over the other lines (Student's test)."
+        )
+    elif any(len(group.rows) > 1 for group in groups):
         floor = ", and of the trivial predictor by more than its own" if results.baseline else ""
         yield (
             "Mean +- sample standard deviation over n seeds. Bold: ahead of every other plain line "
@@ -352,7 +410,7 @@ def footnotes(results: Results) -> Iterator[str]:
     if any(0 < e.count < len(g.rows) for g in groups for e in g.entries.values()):
         yield "A number with its own n is the mean over those seeds that have the value."
     if DELTA[0] in results.columns():
-        yield _delta(results)
+        yield from _delta(results)
     if results.reference is not None:
         yield from _relative(results, results.reference)
     if results.baseline and results.tasks():
@@ -366,7 +424,7 @@ def footnotes(results: Results) -> Iterator[str]:
         yield "Smoke: a few training steps that show that the pipeline works. Not a result."
 
 
-def _delta(results: Results) -> str:
+def _delta(results: Results) -> Iterator[str]:
     rows = [row for group in results.groups for row in group.rows]
     own = [row for row in rows if "delta_baseline" in row]
     against = " or ".join(dict.fromkeys(str(row["delta_baseline"]) for row in own))
@@ -374,14 +432,17 @@ def _delta(results: Results) -> str:
     tasks = list(dict.fromkeys(column.task for column in metrics))
     joint = ", and " if len(metrics) > len(tasks) else ", "
     named = joint.join(_named([c for c in metrics if c.task == task]) for task in tasks)
-    return (
-        f"Delta: over {named}, relative to the baseline ({against}) of the same seed. "
+    of = f" of {results.problem}" if results.problem else ""
+    over = f"Delta{of}: over {named}, relative to the baseline ({against}) of the same seed."
+    defined = (
         f"Flat: mean relative loss over the {_count(metrics)} metrics, so that "
         "less is better and a negative one is a gain. Task: mean relative gain, first over a "
         f"task's metrics and then over the {_count(tasks)} tasks, so that more is better. "
         "Log gain: likewise, of the ratios' logarithms, so that a halved and a doubled error weigh "
-        "the same. The baseline's own is 0 by definition and not shown; bold is ahead of it, too."
+        "the same. The baseline's own is 0 by definition and not shown"
     )
+    bold = "." if results.control is not None else "; bold is ahead of it, too."
+    yield from (over, defined + bold) if of else (f"{over} {defined}{bold}",)
 
 
 def _named(metrics: Sequence[Column]) -> str:
@@ -414,10 +475,13 @@ def build(
     runs_root: Path | None = None,
     baseline: Row | None = None,
     command: str = "",
+    tried: Sequence[Tried] = (),
 ) -> Path:
     """Write the page, the tables and the figures; the same rows give the same bytes.
 
-    The tables are `table.{csv,md,tex}` whole and `readme.md` with the main columns.
+    The tables are `table.{csv,md,tex}` whole, `readme.md` with the main columns, with a control
+    `verdicts.csv`, and of a grid that is tuned `trials.csv`. A suite has quality and cost of each
+    problem, and figures under its name.
 
     Args:
         grid: its name, question, recipe, and under `report` what `Layout` says.
@@ -427,6 +491,7 @@ def build(
         runs_root: where the runs' curves and samples are; without it those figures are left out.
         baseline: the trivial predictor's metrics, under the same keys as a row's.
         command: what reproduces the report.
+        tried: the trials of a grid that is tuned.
 
     Returns:
         The page's path.
@@ -436,37 +501,49 @@ def build(
     """
     layout = Layout.of(grid.report)
     has_section = baseline is None or "metric" in baseline
+    baseline = baseline if has_section else {"metric": baseline}
     rows = [*rows, *_skipped(grid)]
-    results = tabulate(rows, layout, baseline if has_section else {"metric": baseline})
+    problems = [
+        tabulate(own, layout, baseline, name) for name, own in by_problem(rows, layout).items()
+    ]
     judged = judge(rows, layout.rows, layout.control) if layout.control is not None else None
-    with beside(out_dir, known.figures()) as folder:
-        captions = {} if layout.only else _draw(results, folder, runs_root)
-        if judged is not None:
-            captions["forest"] = forest(judged, folder, "forest")
-        _write(grid, rows, results, judged, captions, folder, command)
+    with beside(out_dir, (*known.figures(), VERDICTS, TRIALS)) as folder:
+        figures = [] if judged is None else _figures_of_verdicts(judged, tried, folder)
+        for results in () if layout.only else problems:
+            figures += _figures_of(results, folder, runs_root)
+        _write(grid, rows, problems, judged, tried, figures, folder, command)
     return out_dir / PAGE
 
 
 def _write(
     grid: Any,
     rows: Sequence[Row],
-    results: Results,
+    problems: Sequence[Results],
     judged: Verdicts | None,
-    captions: dict[str, str | None],
+    tried: Sequence[Tried],
+    figures: Sequence[Figure],
     folder: Path,
     command: str,
 ) -> None:
-    wide = known.figures() if len(results.groups) > MANY else WIDE
-    table = fill(results)
+    table = together([fill(results) for results in problems])
+    brief = together([fill(results, short=True) for results in problems])
+    groups = [group for results in problems for group in results.groups]
+    control, tune = Layout.of(grid.report).control, getattr(grid, "tune", None)
+    more = {f"{TRIALS}.csv": trials.records(tried)} if tried else {}
     if judged is not None:
-        table = replace(
-            table,
-            sections=(*table.sections, section(judged)),
-            notes=(*table.notes, *notes(judged)),
-        )
-    elif (control := Layout.of(grid.report).control) is not None:
-        lines = [", ".join(group.identity) for group in results.groups]
+        first, said = sections(judged, tune), tuple(notes(judged))
+        behind = trials.distances(judged, trials.ended(tried))
+        first += [] if behind is None else [behind]
+        table = replace(table, sections=(*first, *table.sections), notes=(*said, *table.notes))
+        rest = brief.sections if len(problems) == 1 else ()  # those of many problems: on the page
+        brief = replace(brief, sections=(*first, *rest), notes=(*said, *brief.notes))
+        more[f"{VERDICTS}.csv"] = records(judged)
+    elif control is not None:
+        lines = [", ".join(group.identity) for group in groups]
         table = replace(table, notes=(*table.notes, untested(control, lines)))
+    if tune is not None:
+        table = replace(table, sections=(*table.sections, tuned.section(rows, tune)))
+    counts = [counted_images(results) for results in problems]
     page = Page(
         kind="grid",
         title=f"{grid.name}: mtl-bench report",
@@ -475,23 +552,54 @@ def _write(
             grid.name, getattr(grid.recipe, "name", grid.recipe), _states(rows) or "none"
         ),
         command=command,
-        banner=results.smoke * f"{table.banner} {TRAINED_BRIEFLY}",
+        banner=f"{table.banner} {TRAINED_BRIEFLY}" if table.banner else "",
         lacking="Cells without numbers",
         nothing="No cell of this grid has numbers yet.",
-        figures=[
-            replace(figure, wide=figure.name in wide)
-            for figure in figures_of(known.figures(), captions)
-        ],
-        protocol=protocol.of_cells([row for group in results.groups for row in group.rows]),
+        figures=figures,
+        protocol=protocol.of_cells([row for group in groups for row in group.rows]),
         of="cells",
-        counted=counted_images(results),
+        files=tuple(more),
+        counted=[section for section in counts if section is not None],
         folded=_every_cell(rows),
     )
-    more = {
-        "readme.md": markdown(fill(results, short=True)),
-        PAGE: render(page, table, folder),
-    }
+    more |= {"readme.md": markdown(brief), PAGE: render(page, table, folder)}
     write(table, folder, more)
+
+
+def _figures_of_verdicts(judged: Verdicts, tried: Sequence[Tried], folder: Path) -> list[Figure]:
+    """Those of all problems together, and of trials each problem's trade-off."""
+    settings = trials.ended(tried)
+    drawn = {
+        "forest": verdict_plots.forest(judged, folder, "forest"),
+        "bands": verdict_plots.bands(judged, folder, "bands"),
+        "profiles": verdict_plots.profiles(judged, folder, "profiles"),
+        "budgets": trials.budgets(judged, settings, folder, "budgets"),
+    }
+    wide = len(judged.problems) > 1 or len(judged.lines) > MANY
+    found = [replace(figure, wide=wide) for figure in figures_of(known.figures(), drawn)]
+    for problem in judged.problems:
+        stem = f"{problem.replace(', ', '-')}-tradeoff" if len(judged.problems) > 1 else "tradeoff"
+        caption = trials.tradeoff(judged, settings, problem, folder, stem)
+        if caption is not None:
+            heading = ": ".join(filter(None, (problem, known.figures()["tradeoff"].lower())))
+            found.append(Figure(stem, capital(heading), caption, wide=True))
+    return found
+
+
+def _figures_of(results: Results, folder: Path, runs_root: Path | None) -> list[Figure]:
+    """Those of one problem, under its name where it is one of several."""
+    of, headings = results.problem, known.figures()
+    where = folder / of
+    where.mkdir(exist_ok=True)
+    captions = _draw(results, where, runs_root)
+    wide = headings if len(results.groups) > MANY else WIDE
+    found = [replace(f, wide=f.name in wide) for f in figures_of(headings, captions)]
+    if not of:
+        return found
+    for path in sorted(where.iterdir()):
+        path.replace(folder / f"{of}-{path.name}")
+    where.rmdir()
+    return [replace(f, name=f"{of}-{f.name}", heading=f"{of}: {f.heading}") for f in found]
 
 
 def _skipped(grid: Any) -> list[Row]:

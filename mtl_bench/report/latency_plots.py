@@ -13,11 +13,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.style import GRAY, MARKERS, looks, save, styled
-from mtl_bench.report.plots import better, draw_front
+from mtl_bench.report.plots import FRONT, better, draw_front, plain_log
 from mtl_bench.report.statistics import SMOKE
 
 if TYPE_CHECKING:
@@ -53,13 +52,13 @@ def against_quality(timings: "Timings", column: Column, out_dir: Path) -> str | 
         for (axes, own), points in zip(panels, fronts, strict=True):
             for line, point in zip(own, points, strict=True):
                 axes.plot(*point, linestyle="", **_marker(timings, line))
-            _plain_log(axes, f"{FPS.title} ({better(FPS)} is better)")
+            plain_log(axes, f"{FPS.title} ({better(FPS)} is better)")
             axes.margins(0.12)
         for (axes, _), points in zip(panels, fronts, strict=True):  # they share the y axis
-            draw_front(axes, points, column.better)
+            draw_front(axes, points, (FPS.better, column.better))
         title = ", ".join(filter(None, (column.title, column.unit)))
         panels[0][0].set_ylabel(f"{title} ({better(column)} is better)")
-        _legend(figure, timings, lines, [Line2D([], [], color=GRAY, label="Pareto front")])
+        _legend(figure, timings, lines, [Line2D([], [], label="Pareto front", **FRONT)])
         save(figure, out_dir, f"{column.name}_{FPS.name}")
     return f"{column.title} over {FPS.in_words}, all tasks. {_where_from(timings)}"
 
@@ -110,7 +109,7 @@ def roofline(timings: "Timings", out_dir: Path) -> str | None:
             _roofs(axes, own, [x for x, _ in points])
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
-            _plain_log(axes, "operations a byte")
+            plain_log(axes, "operations a byte")
         panels[0][0].set_ylabel("GFLOP/s of the network")
         _legend(figure, timings, lines, [])
         save(figure, out_dir, "roofline")
@@ -182,15 +181,6 @@ def _legend(
             shown |= {"fillstyle": "full"} if place != 3 else {}
             handles.append(Line2D([], [], linestyle="", label=name, **shown))
     figure.legend(handles=[*handles, *more], loc="outside right upper")
-
-
-def _plain_log(axes: Axes, label: str) -> None:
-    """A logarithmic x axis with 1, 2, 5, 10 in plain digits."""
-    axes.set_xscale("log")
-    axes.set_xlabel(label)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _where_from(timings: "Timings") -> str:

@@ -4,7 +4,7 @@ import base64
 import contextlib
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from mtl_bench.report.table import Section, Table, pretty
 
 TEMPLATE = "page.html.j2"
 PAGE = "index.html"
+MADE = (".png", ".svg", ".csv")
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ class Page:
     protocol: Protocol | None = None
     of: str = "lines"  # what may differ in the protocol
     same: str = "The same numbers"  # as in the files beside the page
-    counted: Section | None = None
+    files: Sequence[str] = ()  # beside the tables
+    counted: Sequence[Section] = ()
     folded: Section | None = None
 
 
@@ -71,21 +73,23 @@ def figures_of(headings: dict[str, str], captions: dict[str, str | None]) -> lis
 
 
 @contextlib.contextmanager
-def beside(out_dir: Path, figures: Iterable[str] = ()) -> Iterator[Path]:
+def beside(out_dir: Path, figures: Collection[str] = ()) -> Iterator[Path]:
     """A folder to build in, whose files take their places in `out_dir` when the block ends.
 
     If it fails, all there stays as it is.
 
     Args:
-        figures: stems; those that an earlier build drew and this one did not go.
+        figures: stems, which may stand behind a name and `-`; those that an earlier build made and
+            this one did not go.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".new-", dir=out_dir) as folder:
         built = Path(folder)
         yield built
-        for name in (f"{stem}.{suffix}" for stem in figures for suffix in ("png", "svg")):
-            if not (built / name).exists():
-                (out_dir / name).unlink(missing_ok=True)
+        for path in list(out_dir.iterdir()):
+            ours = path.stem.rpartition("-")[2] in figures and path.suffix in MADE
+            if ours and not (built / path.name).exists():
+                path.unlink()
         for path in sorted(built.iterdir()):
             path.replace(out_dir / path.name)
 

@@ -14,6 +14,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from mtl_bench.core.columns import FPS, Column
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 RINGS = (10, 14, 20, 27, 35, 45, 57, 70)  # distances of a number from its point, in points
 ANGLES = [math.radians(a) for a in range(45, 405, 30)]
 ROOM = 9.5  # around a number, in points
+FRONT: dict[str, Any] = {"color": GRAY, "linewidth": 1.2, "zorder": 1}
 Point = tuple[float, float]
 
 
@@ -44,14 +46,18 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         return None
     many = len(groups) > MANY
     with styled():
-        figure = Figure(figsize=(9.2, 4.8) if many else (6.4, 3.6), layout="constrained")
+        longest = max(len(group.label) for group in groups)
+        across = max(1, min(5, 125 // (longest + 12)))  # of a legend below: 125 letters a line
+        lines = math.ceil((len(groups) + 1) / across) if many else 0
+        size = (9.2, 4.2 + 0.16 * lines) if many else (6.4, 3.6)
+        figure = Figure(figsize=size, layout="constrained")
         axes = figure.add_subplot()
         handles: list[Any] = []
         spots = {}
         for index, (group, look) in enumerate(looks_of(results), 1):
             if group in groups:
                 spots[index] = (group.entries[x.name].mean, group.entries[y.name].mean)
-                _point(axes, group, x, y, look)
+                _point(axes, group, x, y, look, 0.35 if many else 1.0)
                 label = f"{index} " * many + f"{group.label} (n={len(group.rows)})"
                 handles.append(Line2D([], [], linestyle="", label=label, **_marker(group, look)))
         if x == FPS and results.baseline and results.baseline.entries[y.name].count:
@@ -61,14 +67,24 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         axes.set_xlabel(f"{with_unit(x)} ({better(x)} is better){where}")
         axes.set_ylabel(f"{with_unit(y)}\n({better(y)} is better)")
         axes.margins(0.12)
+        outside = _zoom(axes, groups, x, y) if many else []
+        spots = {i: s for i, s in spots.items() if results.groups[i - 1] not in outside}
+        plain = [spots[i] for i in spots if not results.groups[i - 1].mark] or [*spots.values()]
+        if len(plain) > 1:
+            draw_front(axes, plain, (x.better, y.better))
+            handles.append(Line2D([], [], label="Pareto front", **FRONT))
         watermark(axes, results)
-        style: dict[str, Any] = {"ncols": 2, "fontsize": 7.5, "columnspacing": 1} if many else {}
-        figure.legend(handles=handles, loc="outside right upper", **style)
+        style: dict[str, Any] = {"loc": "outside right upper"}
+        if many:
+            style = {"loc": "outside lower center", "ncols": across, "fontsize": 7.5}
+        figure.legend(handles=handles, **style)
         if many:
             _number(axes, spots)
         save(figure, out_dir, f"{y.name}_{x.name}")
     if many:
-        return f"{y.title} against {x.title}; the numbers are those of the legend."
+        far = [f"{g.label} {_short(g, y)} at {_short(g, x)}" for g in outside]
+        more = f" Further out: {'; '.join(far)}." if far else ""
+        return f"{y.title} against {x.title}; the numbers are those of the legend.{more}"
     points = "; ".join(f"{g.label} {_short(g, y)} at {_short(g, x)} {x.title}" for g in groups)
     return f"{y.title} against {x.title}. {points}."
 
@@ -152,7 +168,9 @@ def _short(group: Group, column: Column) -> str:
     return number(group.entries[column.name].mean, column)
 
 
-def _point(axes: Axes, group: Group, across: Column, down: Column, look: Look) -> None:
+def _point(
+    axes: Axes, group: Group, across: Column, down: Column, look: Look, opaque: float
+) -> None:
     x, y = group.entries[across.name], group.entries[down.name]
     axes.errorbar(
         x.mean,
@@ -161,9 +179,21 @@ def _point(axes: Axes, group: Group, across: Column, down: Column, look: Look) -
         yerr=None if math.isnan(y.std) else y.std,
         linestyle="",
         elinewidth=1.2,
+        ecolor=(look.color, opaque),
         capsize=2.5,
         **_marker(group, look),
     )
+
+
+def _zoom(axes: Axes, groups: Sequence[Group], x: Column, y: Column) -> list[Group]:
+    """Show the range of most groups; those outside it."""
+    means = np.array([[group.entries[c.name].mean for c in (x, y)] for group in groups])
+    (left, right), (low, high) = (middle(several, several) for several in means.T)
+    across, up = 0.12 * (right - left) or 1.0, 0.12 * (high - low) or 1.0
+    axes.set_xlim(left - across, right + across)
+    axes.set_ylim(low - up, high + up)
+    shown = np.all((means >= (left, low)) & (means <= (right, high)), axis=1)
+    return [group for group, inside in zip(groups, shown, strict=True) if not inside]
 
 
 def _number(axes: Axes, spots: Mapping[int, tuple[float, float]]) -> None:
@@ -238,6 +268,26 @@ def _merged(several: Iterable[Iterable[str]]) -> list[str]:
     return found
 
 
+def plain_log(axes: Axes, label: str) -> None:
+    """A logarithmic x axis with 1, 2, 5, 10 in plain digits."""
+    axes.set_xscale("log")
+    axes.set_xlabel(label)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def middle(lows: NDArray[np.float64], highs: NDArray[np.float64], least: float = 0.0) -> Point:
+    """The range of all, without those far out: beyond 1.5 times the middle half's width.
+
+    Args:
+        least: what a width is taken for at least.
+    """
+    first, third = float(np.percentile(lows, 25)), float(np.percentile(highs, 75))
+    room = 1.5 * max(third - first, least)
+    return max(float(np.min(lows)), first - room), min(float(np.max(highs)), third + room)
+
+
 def watermark(axes: Axes, results: "Results") -> None:
     if results.smoke:
         look: dict[str, Any] = {"rotation": 15, "color": GRAY, "alpha": 0.45, "fontsize": 13}
@@ -265,18 +315,20 @@ def front(points: Sequence[Point], better: tuple[int, int] = (+1, +1)) -> list[i
     return sorted(kept, key=lambda index: points[index])
 
 
-def draw_front(axes: Axes, points: Sequence[Point], better: int) -> None:
+def draw_front(axes: Axes, points: Sequence[Point], better: tuple[int, int] = (+1, +1)) -> None:
     """The front as stairs from edge to edge of axes that show the points already.
 
     Args:
-        better: of the second number, +1: higher, -1: lower; of the first it is higher.
+        better: as in `front`.
 
-    Their height is the second number that can be had at the first number or more.
+    Their height is the second number that can be had at the first number or a better one.
     """
-    corners = [points[index] for index in front(points, (+1, better))]
+    corners = [points[index] for index in front(points, better)]
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    ends = (left, corners[0][1]), (corners[-1][0], low if better > 0 else high)
-    xs, ys = zip(ends[0], *corners, ends[1], strict=True)
-    axes.plot(xs, ys, drawstyle="steps-pre", color=GRAY, linewidth=1.2, zorder=1)
+    corners = corners if better[0] > 0 else corners[::-1]
+    first = (left if better[0] > 0 else right, corners[0][1])
+    last = (corners[-1][0], low if better[1] > 0 else high)
+    xs, ys = zip(first, *corners, last, strict=True)
+    axes.plot(xs, ys, drawstyle="steps-pre", **FRONT)
     axes.set_xlim(left, right)
     axes.set_ylim(low, high)

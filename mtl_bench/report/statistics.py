@@ -1,5 +1,6 @@
 """Lines of a table: cells that differ only in their seed, with mean, spread and who leads."""
 
+import itertools
 import json
 import math
 import sys
@@ -8,9 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pandas as pd
+import numpy as np
 
 from mtl_bench.core.columns import Column
+from mtl_bench.report import evidence
 from mtl_bench.report.columns import DELTA, RELATIVE, Row, columns, flatten, measured, text
 
 T = TypeVar("T")
@@ -28,6 +30,8 @@ KNOWN = (  # axes in the order in which they stand
     *("method", "backbone", "tasks", "single_task", "video", "granularity"),
     *("replay", "pretrained", "recipe.name"),
 )
+PROBLEM = ("recipe.name", "backbone", "tasks", "pretrained")  # axes that make a problem of its own
+FEW = 4  # lines of a table: of more, what is bold leads the control by a test
 SHOWN = ("done", "stale")  # statuses that have numbers
 
 
@@ -79,6 +83,18 @@ def cell_of(row: Row) -> dict[str, Any]:
     }
 
 
+def recipe_of(row: Row) -> str:
+    return str(cell_of(row).get("recipe.name", ""))
+
+
+def by_recipe(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Recipe's name -> its rows."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(recipe_of(row), []).append(row)
+    return found
+
+
 def axes_of(rows: Sequence[Row], axis: str) -> tuple[str, ...]:
     """The row axis and whatever else differs between the cells, best known first.
 
@@ -96,18 +112,33 @@ def axes_of(rows: Sequence[Row], axis: str) -> tuple[str, ...]:
     return (axis, *(key for key in rest if key != axis))
 
 
+def own_and_shared(axes: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Places of the axes that name a line, and of those that name its problem."""
+    own = [i for i, axis in enumerate(axes) if not i or axis not in PROBLEM]
+    return own, [i for i in range(len(axes)) if i not in own]
+
+
+def names_of(identity: Sequence[str], axes: Sequence[str]) -> tuple[str, str]:
+    """A line and its problem, of values of the axes."""
+    line, problem = (", ".join(identity[i] for i in some) for some in own_and_shared(axes))
+    return line, problem
+
+
 def grouped(
     rows: Sequence[Row],
     axes: tuple[str, ...],
     trivial: Group | None = None,
     reference: str | None = None,
+    control: str | None = None,
 ) -> list[Group]:
     """The lines, in the order in which their first cells come, with numbers or without.
 
     Args:
         trivial: what a leader has to beat, too.
         reference: value of the first axis whose line the RELATIVE columns are relative to.
+        control: the line that a leader has to beat, in a table of more than FEW.
     """
+    every = columns()
     order: dict[str, int] = {}
     members: dict[tuple[str, str, bool], list[Row]] = {}
     for i, row in enumerate(rows):
@@ -122,23 +153,28 @@ def grouped(
             status=status,
             smoke=smoke,
             rows=tuple(several),
-            entries=_entries(several),
+            entries=_entries(several, (*every, *RELATIVE)),
         )
         for (_, status, smoke), several in sorted(members.items(), key=lambda m: order[m[0][0]])
     ]
-    groups = [_with_leaders(group, groups, trivial) for group in groups]
+    if tested(groups, axes, control):
+        leading = _tested(groups, axes, str(control), every)
+    else:
+        leading = [[c for c in every if _leads(g, c, groups, trivial)] for g in groups]
+    groups = [_with_bold(group, bold) for group, bold in zip(groups, leading, strict=True)]
     return [_with_relative(group, groups, reference) for group in groups]
 
 
 def trivial_group(baseline: Row, axes: tuple[str, ...]) -> Group:
     name = ("trivial predictor", *("" for _ in axes[1:]))
-    return Group(name, "trivial", False, (), _entries([baseline]))
+    return Group(name, "trivial", False, (), _entries([baseline], (*columns(), *RELATIVE)))
 
 
 def entry_of(values: Sequence[float]) -> Entry:
     """Of those that are no NaN."""
-    known = pd.Series(values, dtype=float)
-    return Entry(float(known.mean()), float(known.std()), int(known.count()))
+    known = np.array([value for value in values if not math.isnan(value)])
+    spread = float(known.std(ddof=1)) if len(known) > 1 else math.nan
+    return Entry(float(known.mean()), spread, len(known)) if len(known) else Entry()
 
 
 def kept(group: Group, runs_root: Path, name: str, load: Callable[[Path], T]) -> Iterator[T]:
@@ -159,8 +195,7 @@ def _varies(cells: list[dict[str, Any]], key: str) -> bool:
     return len({json.dumps(cell.get(key)) for cell in having}) > 1
 
 
-def _entries(rows: Sequence[Row]) -> dict[str, Entry]:
-    every = (*columns(), *RELATIVE)
+def _entries(rows: Sequence[Row], every: Sequence[Column]) -> dict[str, Entry]:
     return {c.name: entry_of([measured(row, c) for row in rows]) for c in every}
 
 
@@ -176,12 +211,43 @@ def _with_relative(group: Group, groups: list[Group], reference: str | None) -> 
     return replace(group, entries=entries)
 
 
-def _with_leaders(group: Group, groups: list[Group], trivial: Group | None) -> Group:
-    entries = dict(group.entries)
-    for column in columns():
-        leads = _leads(group, column, groups, trivial)
-        entries[column.name] = replace(entries[column.name], bold=leads)
+def _with_bold(group: Group, bold: Sequence[Column]) -> Group:
+    names = {column.name for column in bold}
+    entries = {k: replace(e, bold=k in names) for k, e in group.entries.items()}
     return replace(group, entries=entries)
+
+
+def tested(groups: Sequence[Group], axes: Sequence[str], control: str | None) -> bool:
+    """Whether bold is what leads the control by a test: it is there, and more than FEW lines."""
+    names = {names_of(group.identity, axes)[0] for group in groups if not group.mark}
+    return control in names and len(names) > FEW
+
+
+def _tested(
+    groups: list[Group], axes: tuple[str, ...], control: str, every: Sequence[Column]
+) -> list[list[Column]]:
+    """By group, the columns in which it leads the control of its problem."""
+    found: list[list[Column]] = [[] for _ in groups]
+    places = {names_of(g.identity, axes): i for i, g in enumerate(groups) if not g.mark}
+    for problem in dict.fromkeys(problem for _, problem in places):
+        at = [i for (line, own), i in places.items() if own == problem and line != control]
+        base = places.get((control, problem))
+        if base is None:
+            continue
+        seeds = sorted({row["seed"] for i in (*at, base) for row in groups[i].rows})
+        for column in every:
+            rivals = [i for i in at if groups[i].entries[column.name].count > 1]
+            value_LN = np.array([_by_seed(groups[i], column, seeds) for i in rivals])
+            leads = evidence.ahead(value_LN, _by_seed(groups[base], column, seeds))
+            for i in itertools.compress(rivals, leads):
+                found[i].append(column)
+    return found
+
+
+def _by_seed(group: Group, column: Column, seeds: Sequence[int]) -> evidence.Array:
+    """Values, of which more is better."""
+    own = {row["seed"]: column.better * measured(row, column) for row in group.rows}
+    return np.array([own.get(seed, math.nan) for seed in seeds])
 
 
 def _leads(group: Group, column: Column, groups: list[Group], trivial: Group | None) -> bool:

@@ -5,24 +5,41 @@ is held against. Runs are paired by problem (recipe, backbone, tasks) and seed; 
 as the worst, a missing one leaves its block out. The other lines are the family of Holm's test.
 """
 
+import csv
+import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from mtl_bench.core.columns import Column
 from mtl_bench.core.plain import did_you_mean
-from mtl_bench.core.style import BASELINE, GRAY, PALETTE, save, styled
 from mtl_bench.report import evidence
-from mtl_bench.report.columns import Row, column, measured, text
+from mtl_bench.report.columns import DELTA, Row, column, measured, text
 from mtl_bench.report.evidence import Array, Comparison, Estimate
-from mtl_bench.report.statistics import SMOKE, axes_of, cell_of
-from mtl_bench.report.table import PLUS_MINUS, Cell, Head, Section, TableRow
+from mtl_bench.report.statistics import axes_of, by_recipe, cell_of, own_and_shared
+from mtl_bench.report.table import FEWER, Cell, Head, Section, TableRow
+from mtl_bench.report.tuned import note
 
-PROBLEM = ("recipe.name", "backbone", "tasks", "pretrained")  # axes that make a problem of its own
-COLORS = {"better": PALETTE[2], "worse": PALETTE[1], "equivalent": PALETTE[0], "open": GRAY}
+VERDICTS = ("better", "worse", "equivalent", "open")
+MARK = "*"  # behind a difference whose p by Holm is at most 0.05
+ALL = "all problems"
+Blocks = dict[str, dict[tuple[str, int], float]]  # line -> problem and seed -> value
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What the runs of a grid measured: by line, problem and seed."""
+
+    labels: tuple[str, ...]
+    problems: tuple[str, ...]
+    seeds: tuple[int, ...]
+    gain_LMN: Array  # points; NaN: missing, -inf: failed
+    others: tuple[Array, ...]  # the same by the other definitions of a delta, percent
+    step_LMN: Array  # ms; NaN: unknown
 
 
 @dataclass(frozen=True)
@@ -30,21 +47,34 @@ class Line:
     """A line's case against the control."""
 
     label: str
-    comparison: Comparison
+    comparison: Comparison  # over all problems
     iqm: Estimate  # of its own gains over all problems
     step_x: float  # its step time over the control's, mean over blocks
+    by_problem: tuple[Comparison, ...]  # tested by Student: a problem has few seeds
+    without: tuple[Comparison, ...]  # of all problems but one; of one problem none
+    rank: float  # by mean gain, the control among them; NaN for a line that lacks a problem
+    chosen: tuple[float, float]  # its ranks over definitions of the delta and left-out problems
+    drawn: tuple[float, float]  # its ranks over resampled seeds, the middle 95 %
 
 
 @dataclass(frozen=True)
 class Verdicts:
     """All lines of a grid against its control, the best first."""
 
-    control: str
-    control_iqm: Estimate
+    control: Line  # compared with itself
     lines: tuple[Line, ...]
-    problems: int
-    seeds: int
+    scores: Scores
     smoke: bool
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        return self.scores.problems
+
+    @property
+    def ranked(self) -> list[Line]:
+        """The control among the others, by its mean gain; those without a rank are absent."""
+        known = [line for line in (*self.lines, self.control) if not math.isnan(line.rank)]
+        return sorted(known, key=lambda line: line.rank)
 
 
 def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
@@ -56,72 +86,120 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
         control: its value that the others are held against.
     """
     rows = [row for row in rows if row.get("status", "done") in ("done", "failed")]
-    axes = axes_of(rows, axis) if rows else (axis,)
-    own = [a for a in axes if a == axis or a not in PROBLEM]
-    shared = [a for a in axes if a not in own]
-    gains = _by_block(rows, own, shared, _gain)
-    if control not in gains:
+    of = scores(rows, axis)
+    if control not in of.labels:
         return None
-    problems = list(dict.fromkeys(problem for line in gains.values() for problem, _ in line))
-    seeds = sorted({seed for line in gains.values() for _, seed in line})
-    score_LMN = np.array([_table(line, problems, seeds) for line in gains.values()])
-    step = column("step_ms")
-    steps = _by_block(rows, own, shared, lambda row: measured(row, step))
-    step_LMN = np.array([_table(steps[label], problems, seeds) for label in gains])
-    at = list(gains).index(control)
-    rest = [i for i, label in enumerate(gains) if i != at]
-    compared = evidence.compare(score_LMN[rest], score_LMN[at])
-    if not any(each.blocks > 1 for each in compared):
+    at = of.labels.index(control)
+    gain_LMN = of.gain_LMN
+    rest = [i for i in range(len(of.labels)) if i != at]
+    compare = partial(_compare, gain_LMN, at)
+    over_all = compare()
+    if not any(over_all[i].blocks > 1 for i in rest):
         return None
-    iqms = evidence.bootstrap(score_LMN)
-    labels = list(gains)
-    lines = [
-        Line(labels[i], each, iqms[i], _ratio(step_LMN[i], step_LMN[at]))
-        for i, each in zip(rest, compared, strict=True)
-        if each.blocks
-    ]
+    places = range(len(of.problems))
+    by_problem = [compare([m], test=evidence.student) for m in places]
+    without = [compare([o for o in places if o != m]) for m in places if len(places) > 1]
+    iqms = evidence.bootstrap(gain_LMN)
+    ranks = evidence.ranks(evidence.suite_mean(gain_LMN))
+    chosen, drawn = evidence.rank_bands([gain_LMN, *of.others])
+    found = {
+        i: Line(
+            label=of.labels[i],
+            comparison=over_all[i],
+            iqm=iqms[i],
+            step_x=_ratio(of.step_LMN[i], of.step_LMN[at]),
+            by_problem=tuple(each[i] for each in by_problem),
+            without=tuple(each[i] for each in without),
+            rank=float(ranks[i]),
+            chosen=tuple(chosen[i]),
+            drawn=tuple(drawn[i]),
+        )
+        for i in range(len(of.labels))
+        if over_all[i].blocks or i == at
+    }
+    lines = [line for i, line in found.items() if i != at]
     lines.sort(key=lambda line: -np.nan_to_num(line.comparison.difference.mean, nan=-1e9))
     smoke = any(row.get("smoke") for row in rows)
-    return Verdicts(control, iqms[at], tuple(lines), len(problems), len(seeds), smoke)
+    return Verdicts(found[at], tuple(lines), of, smoke)
 
 
-# --- the section and the picture ------------------------------------------------------------------
+def scores(rows: Sequence[Row], axis: str) -> Scores:
+    """Every run's numbers in their places.
 
+    A line whose finished runs have no gain, as the baseline's, is none; one of failed runs is.
+    """
+    named = list(_named(rows, axis))
+    gains = {
+        line: of
+        for line, of in _by_block(named, _gain).items()
+        if any(map(math.isfinite, of.values())) or all(map(math.isinf, of.values()))
+    }
+    blocks = {b: 0 for of in gains.values() for b, gain in of.items() if not math.isnan(gain)}
+    problems = tuple(dict.fromkeys(problem for problem, _ in blocks))
+    seeds = tuple(sorted({seed for _, seed in blocks}))
 
-def section(found: Verdicts) -> Section:
-    """A line each: difference with its interval, P(X > Y), p by Holm, verdict, cost."""
-    heads = (
-        Head("line", left=True),
-        Head("blocks"),
-        Head(f"difference to {found.control}", "points"),
-        Head("95 % interval"),
-        Head("P(X>Y)"),
-        Head("p", "Holm"),
-        Head("verdict", left=True),
-        Head("IQM of gain", "points"),
-        Head("step", f"x of {found.control}"),
+    def table(of: Blocks) -> Array:
+        found = [[[of[k].get((p, s), math.nan) for s in seeds] for p in problems] for k in gains]
+        return np.array(found).reshape(len(gains), len(problems), len(seeds))
+
+    def number(of: Column) -> Callable[[Row], float]:
+        return lambda row: measured(row, of)
+
+    step_ms, others = column("step_ms"), [c for c in DELTA if c.name != "gain"]
+    return Scores(
+        labels=tuple(gains),
+        problems=problems,
+        seeds=seeds,
+        gain_LMN=table(gains),
+        others=tuple(table(_by_block(named, partial(_signed_delta, c))) for c in others),
+        step_LMN=table(_by_block(named, number(step_ms))),
     )
-    lines = [_table_row(line) for line in found.lines]
-    own = TableRow.of(found.control, *[""] * 6, _points(found.control_iqm), "")
-    return Section(
-        heading=f"Against {found.control}",
-        heads=heads,
-        lines=(*lines, own),
-        source=sentence(found),
-        caption=f"Against {found.control}. {sentence(found)} {' '.join(notes(found))}",
-    )
+
+
+# --- what is said of it ---------------------------------------------------------------------------
+
+
+def sections(found: Verdicts, tune: Any = None) -> list[Section]:
+    """The whole comparison, then problem by problem where there are several.
+
+    Args:
+        tune: the grid's section [tune].
+    """
+    return [_over_all(found, tune), *([_by_problem(found)] if len(found.problems) > 1 else [])]
 
 
 def sentence(found: Verdicts) -> str:
     """What the whole comparison says, in one sentence."""
-    total = len(found.lines)
-    of = {word: [x for x in found.lines if x.comparison.verdict == word] for word in COLORS}
+    total, control = len(found.lines), found.control.label
+    of = {word: [x for x in found.lines if x.comparison.verdict == word] for word in VERDICTS}
     cost = [line.step_x for line in of["better"] if not math.isnan(line.step_x)]
     at = f" (at {np.median(cost):.2f} times its step time)" if cost else ""
+    suite = f" over {len(found.problems)} problems" if len(found.problems) > 1 else ""
     return (
-        f"{total} line{'s' * (total > 1)} against {found.control}: {len(of['better'])} better{at}, "
-        f"{len(of['equivalent'])} equivalent within {evidence.MARGIN:g} point, "
-        f"{len(of['worse'])} worse, {len(of['open'])} open."
+        f"{len(of['better'])} of {total} line{'s' * (total > 1)} beat{'s' * (total == 1)} "
+        f"{control}{suite}{at}, {len(of['equivalent'])} {_are(of['equivalent'])} equivalent within "
+        f"{evidence.MARGIN:g} point, {len(of['worse'])} {_are(of['worse'])} worse, "
+        f"{len(of['open'])} {_are(of['open'])} open."
+    )
+
+
+def protocol(found: Verdicts, tune: Any = None) -> str:
+    """How the comparison was made, for a paper: budget, results, test, margin.
+
+    Args:
+        tune: the grid's section [tune].
+    """
+    budget = (
+        "Untuned: every line has the settings that the grid gives it, published ones or its own."
+    )
+    blocks = max(line.comparison.blocks for line in found.lines)
+    seeds = ", ".join(map(str, found.scores.seeds))
+    several = f" x {len(found.problems)} problems" if len(found.problems) > 1 else ""
+    return (
+        f"{budget if tune is None else note(tune)} Results: seeds {seeds}{several}, n = {blocks} "
+        f"blocks; family: {len(found.lines)} line{'s' * (len(found.lines) > 1)} against "
+        f"{found.control.label}, sign-flip test, two-sided, by Holm at "
+        f"{1 - evidence.LEVEL:.2g}; margin of equivalence: {evidence.MARGIN:g} point."
     )
 
 
@@ -144,17 +222,32 @@ def notes(found: Verdicts) -> list[str]:
     blocks = max(line.comparison.blocks for line in found.lines)
     made = " x ".join(
         f"{count} {what}{'s' * (count > 1)}"
-        for what, count in (("problem", found.problems), ("seed", found.seeds))
+        for what, count in (("problem", len(found.problems)), ("seed", len(found.scores.seeds)))
     )
+    several = len(found.problems) > 1
     said = [
         "Gain: 100 times the mean log ratio to the baseline of the same seed, first over a task's "
         "metrics and then over tasks; one point is about one percent.",
-        f"Differences are paired by problem and seed ({made}); their interval is Student's, over "
-        "the given problems. p: sign-flip test, two-sided, by Holm over the "
-        f"{len(found.lines)} lines. Equivalent: the 90 % interval lies inside "
+        f"Differences are paired by problem and seed ({made}, n = {blocks} blocks); their interval "
+        "is Student's, over the given problems. p: sign-flip test, two-sided, by Holm over the "
+        f"family of {len(found.lines)} lines. Equivalent: the 90 % interval lies inside "
         f"+-{evidence.MARGIN:g} point. IQM: mean of the middle half of a line's own gains, with a "
         "bootstrap over seeds.",
+        f"Rank: by mean gain, {found.control.label} among the lines; below it the range over "
+        "definitions of the delta (log gain, flat, by task)"
+        f"{' and left-out problems' * several}, and the middle 95 % over resampled seeds.",
     ]
+    if several:
+        said.append(
+            f"{MARK} p by Holm at most 0.05: of one problem by Student's paired test over its "
+            "seeds, of all by the sign-flip test. Verdicts hold for these problems; the last "
+            "columns leave out each of them in turn."
+        )
+    if any(line.comparison.blocks < blocks for line in found.lines):
+        said.append(
+            f"{FEWER} Fewer blocks than another line: runs are missing, and a line without any run "
+            "of a problem has no rank."
+        )
     failed = sum(line.comparison.failed for line in found.lines)
     if failed:
         said.append(
@@ -170,69 +263,84 @@ def notes(found: Verdicts) -> list[str]:
     return said
 
 
-def forest(found: Verdicts, out_dir: Path, name: str) -> str | None:
-    """The differences with their intervals, coloured by verdict, and the margin of equivalence.
+def records(found: Verdicts) -> str:
+    """`verdicts.csv`: a line per comparison, over all problems, in each, and without each."""
+    file = io.StringIO()
+    heads = ("line", "control", "problems", "blocks", "failed", "difference", "low", "high")
+    more = ("superior", "p", "p_holm", "verdict", "step_x", "rank", "rank_best", "rank_worst")
+    out = csv.writer(file, lineterminator="\n")
+    out.writerow([*heads, *more])
+    for line in found.lines:
+        named = [(ALL, line.comparison)]
+        if line.without:
+            named += zip(found.problems, line.by_problem, strict=True)
+        named += [(f"without {p}", e) for p, e in zip(found.problems, line.without, strict=False)]
+        for problems, each in named:
+            of = each.difference
+            numbers = (of.mean, of.low, of.high, each.superior, each.p, each.p_holm)
+            cost = (line.step_x, line.rank, *band(line)) if problems == ALL else [math.nan] * 4
+            words = [_plain(value) for value in (*numbers, *cost)]
+            named_by = [line.label, found.control.label, problems, each.blocks, each.failed]
+            out.writerow([*named_by, *words[:6], each.verdict, *words[6:]])
+    return file.getvalue()
 
-    Returns:
-        What the figure shows in words, or None where every line has failed runs.
-    """
-    shown = [line for line in found.lines if np.isfinite(line.comparison.difference.mean)]
-    if not shown:
-        return None
-    with styled():
-        figure = Figure(figsize=(7.2, 1.3 + 0.24 * len(shown)), layout="constrained")
-        axes = figure.add_subplot()
-        axes.axvspan(-evidence.MARGIN, evidence.MARGIN, color="#eeeeee", zorder=0)
-        axes.axvline(0, **BASELINE)
-        for place, line in enumerate(shown):
-            of, color = line.comparison.difference, COLORS[line.comparison.verdict]
-            if np.isfinite(of.low):
-                axes.plot([of.low, of.high], [place, place], color=color, linewidth=2)
-            axes.plot(of.mean, place, "o", color=color, markersize=5)
-        axes.set_yticks(range(len(shown)), [line.label for line in shown])
-        axes.set_ylim(len(shown) - 0.4, -0.6)
-        axes.grid(visible=False, axis="y")
-        axes.set_xlabel(f"difference of gain to {found.control}, points (more is better)")
-        for word, color in COLORS.items():
-            if any(line.comparison.verdict == word for line in shown):
-                axes.plot([], [], "o-", color=color, label=word, markersize=5)
-        figure.legend(loc="outside right upper")
-        if found.smoke:
-            axes.set_title(SMOKE, color="#a40000")
-        save(figure, out_dir, name)
-    left_out = [line.label for line in found.lines if line not in shown]
-    lacking = f" Not drawn, as runs failed: {', '.join(left_out)}." if left_out else ""
-    return (
-        f"Paired differences to {found.control} with 95 % intervals; gray: the margin of "
-        f"equivalence, {PLUS_MINUS}{evidence.MARGIN:g} point. {sentence(found)}{lacking}"
-    )
+
+def band(line: Line) -> tuple[float, float]:
+    """The best and the worst rank of a line by any choice or draw."""
+    both = (line.chosen, line.drawn)
+    return min(low for low, _ in both), max(high for _, high in both)
 
 
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _by_block(
-    rows: Sequence[Row], own: Sequence[str], shared: Sequence[str], value: Callable[[Row], float]
-) -> dict[str, dict[tuple[str, int], float]]:
-    """Line -> block (problem, seed) -> value."""
-    found: dict[str, dict[tuple[str, int], float]] = {}
-    for row in rows:
-        cell = cell_of(row)
-        line, problem = (", ".join(text(cell.get(axis)) for axis in axes) for axes in (own, shared))
+def _named(rows: Sequence[Row], axis: str) -> Iterator[tuple[str, str, Row]]:
+    """Line, problem and row: a problem's name is its recipe's where there are several, and what
+    else makes it one."""
+    recipes = by_recipe(rows)
+    axes = {name: axes_of(several, axis) for name, several in recipes.items()}
+    parts = {name: own_and_shared(several) for name, several in axes.items()}
+    own = dict.fromkeys(axes[name][i] for name in recipes for i in parts[name][0])
+    for name, several in recipes.items():
+        shared = [axes[name][i] for i in parts[name][1]]
+        for row in several:
+            cell = cell_of(row)
+            line = ", ".join(text(cell.get(key)) for key in own)
+            named = [name] * (len(recipes) > 1) + [text(cell.get(key)) for key in shared]
+            tuned = row.get("tuned", {})  # what trials were of is called by them
+            yield tuned.get("line", line), tuned.get("problem", ", ".join(named)), row
+
+
+def _by_block(named: Sequence[tuple[str, str, Row]], value: Callable[[Row], float]) -> Blocks:
+    found: Blocks = {}
+    for line, problem, row in named:
         found.setdefault(line, {})[problem, int(row["seed"])] = value(row)
     return found
 
 
-def _table(line: Mapping[tuple[str, int], float], problems: list[str], seeds: list[int]) -> Array:
-    return np.array([[line.get((p, s), math.nan) for s in seeds] for p in problems])
-
-
 def _gain(row: Row) -> float:
     """In points; -inf for a failed run."""
-    if row.get("status") == "failed":
-        return -math.inf
-    percent = float(row.get("metric", {}).get("delta.gain", math.nan))
-    return -math.inf if percent == -100 else 100 * math.log1p(percent / 100)
+    percent = _signed_delta(DELTA[-1], row)
+    return -math.inf if percent <= -100 else 100 * math.log1p(percent / 100)
+
+
+def _signed_delta(of: Column, row: Row) -> float:
+    """Percent, of which more is better; -inf for a failed run."""
+    return -math.inf if row.get("status") == "failed" else of.better * measured(row, of)
+
+
+def _compare(
+    gain_LMN: Array,
+    at: int,
+    problems: Sequence[int] | None = None,
+    test: Callable[[Array], float] | None = None,
+) -> list[Comparison]:
+    """Each line against the one at a place, over some problems; that one's own is in its place."""
+    chosen_LMN = gain_LMN if problems is None else gain_LMN[:, problems]
+    rest = np.delete(chosen_LMN, at, axis=0)
+    found = evidence.compare(rest, chosen_LMN[at], test)
+    (own,) = evidence.compare(chosen_LMN[at : at + 1], chosen_LMN[at], test)
+    return [*found[:at], own, *found[at:]]
 
 
 def _ratio(step_MN: Array, control_MN: Array) -> float:
@@ -240,21 +348,113 @@ def _ratio(step_MN: Array, control_MN: Array) -> float:
     return float(np.mean(step_MN[both] / control_MN[both])) if both.any() else math.nan
 
 
-def _table_row(line: Line) -> TableRow:
+def _over_all(found: Verdicts, tune: Any) -> Section:
+    """A line each: difference with its interval, P(X > Y), p by Holm, verdict, rank, cost."""
+    control = found.control.label
+    most = max(line.comparison.blocks for line in found.lines)
+    heads = (
+        Head("line", left=True),
+        Head("blocks"),
+        Head(f"difference to {control}", "points"),
+        Head("95 % interval"),
+        Head("P(X>Y)"),
+        Head("p", "Holm"),
+        Head("verdict", left=True),
+        Head("IQM of gain", "points"),
+        Head("rank", "and its range"),
+        Head("step", f"x of {control}"),
+    )
+    own = TableRow.of(control, *[""] * 6, _points(found.control.iqm), _rank(found.control), "1.00")
+    return Section(
+        heading=f"Against {control}",
+        heads=heads,
+        lines=(*(_table_row(line, most) for line in found.lines), own),
+        source=f"{sentence(found)} {protocol(found, tune)}",
+        caption=" ".join(
+            [f"Against {control}.", sentence(found), protocol(found, tune), *notes(found)]
+        ),
+    )
+
+
+def _by_problem(found: Verdicts) -> Section:
+    """A line each: difference in every problem, and over all when one of them is left out."""
+    control = found.control.label
+    heads = [Head("line", left=True), *(Head(problem, "points") for problem in found.problems)]
+    heads += [Head(ALL, "points"), Head("one left out", "least, most")]
+    heads += [Head("verdict without it", left=True)]
+    lines = []
+    for line in found.lines:
+        every = [each.difference.mean for each in line.without]
+        known = [value for value in every if not math.isnan(value)]
+        range_of = Cell(f"{_signed(min(known))}, {_signed(max(known))}") if known else Cell("-")
+        cells = [_difference(each) for each in (*line.by_problem, line.comparison)]
+        lines.append(TableRow.of(line.label, *cells, range_of, _stands(line, found.problems)))
+    return Section(
+        heading=f"Difference to {control} by problem",
+        heads=tuple(heads),
+        lines=tuple(lines),
+        caption=(
+            f"Paired differences of gain to {control} by problem, with 95 % intervals. {MARK}: p "
+            "by Holm at most 0.05; bold: better."
+        ),
+    )
+
+
+def _stands(line: Line, problems: Sequence[str]) -> str:
+    """Whether the verdict stays, whatever problem is left out."""
+    own = line.comparison.verdict
+    other = [
+        f"{each.verdict} without {problem}"
+        for problem, each in zip(problems, line.without, strict=True)
+        if each.verdict != own
+    ]
+    return ", ".join(other) or f"{own}, whichever"
+
+
+def _table_row(line: Line, most: int) -> TableRow:
     each = line.comparison
     of, p = each.difference, each.p_holm
     between = "-" if np.isnan(of.low) else f"{_signed(of.low)} ... {_signed(of.high)}"
     return TableRow.of(
         line.label,
-        str(each.blocks),
-        Cell(_signed(of.mean), bold=each.verdict == "better", value=of.mean),
+        f"{each.blocks}{FEWER * (each.blocks < most)}",
+        Cell(_marked(each), bold=each.verdict == "better", value=of.mean),
         between,
         f"{each.superior:.2f}",
         Cell("< 0.001" if p < 0.001 else f"{p:.3f}", value=p),
         each.verdict,
         _points(line.iqm),
+        _rank(line),
         "-" if math.isnan(line.step_x) else f"{line.step_x:.2f}",
     )
+
+
+def _difference(each: Comparison) -> Cell:
+    of = each.difference
+    if math.isnan(of.mean):
+        return Cell("-")
+    between = "" if math.isnan(of.low) else f"({_signed(of.low)} ... {_signed(of.high)})"
+    return Cell(_marked(each), between, each.verdict == "better", of.mean)
+
+
+def _marked(each: Comparison) -> str:
+    told = each.verdict in ("better", "worse") and math.isfinite(each.difference.mean)
+    return _signed(each.difference.mean) + MARK * told
+
+
+def _rank(line: Line) -> Cell:
+    if math.isnan(line.rank):
+        return Cell("-")
+    best, worst = band(line)
+    return Cell(f"{line.rank:g}", f"({best:g} ... {worst:g})", value=line.rank)
+
+
+def _are(lines: Sequence[Line]) -> str:
+    return "is" if len(lines) == 1 else "are"
+
+
+def _plain(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.6g}"
 
 
 def _signed(value: float) -> str:

@@ -75,7 +75,10 @@ class Normals(Task):
         valid_BHW = true_B3HW.square().sum(1) > 0.5
         if not valid_BHW.any():
             return {}
-        lost_BHW = 1 - (F.normalize(full(maps[self.name]), dim=1) * true_B3HW).sum(1)
+        map_B3HW = full(maps[self.name])
+        # F.normalize's norm over channels takes 20 times as long on a CPU
+        length_B1HW = map_B3HW.square().sum(1, keepdim=True).clamp_min(1e-24).sqrt()
+        lost_BHW = 1 - (map_B3HW / length_B1HW * true_B3HW).sum(1)
         return {"normal_cosine": (lost_BHW * valid_BHW).sum() / valid_BHW.sum()}
 
     def finish(

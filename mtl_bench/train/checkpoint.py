@@ -131,8 +131,8 @@ def restore(
     load(path, state, "optimizer", optimizer)
     load(path, state, "scaler", scaler)
     torch.set_rng_state(state["rng"])
-    if state["rng_cuda"] and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all(state["rng_cuda"])
+    for index, drawn in enumerate(state["rng_cuda"][: torch.cuda.device_count()]):
+        torch.cuda.set_rng_state(drawn, index)  # of those that were visible then: the first is used
     return int(state["step"])
 
 

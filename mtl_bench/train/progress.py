@@ -11,9 +11,10 @@ from pathlib import Path
 from types import FrameType
 
 from mtl_bench.core.files import replacing
-from mtl_bench.core.locks import Quiet
+from mtl_bench.core.locks import STEP_S, Quiet
 from mtl_bench.core.provenance import cores
 
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)  # the last: a queue's time limit is near
 WINDOW = 20  # steps whose median is their pace
 SLOW = 2.0  # times the first window's pace, of which the log tells
 
@@ -29,27 +30,31 @@ class Progress:
         self._path = run_dir / "progress.json"
         self._every_s = every_s
         self._echo = echo
-        self._last = 0.0
+        self._last = self._passed = 0.0
         self._start = time.monotonic()
         self.quiet = Quiet(run_dir.parent)
         self.stop_asked = False
 
     def catch_signals(self) -> None:
-        """Turn the first SIGINT or SIGTERM into a request; a second one kills as usual."""
-        for number in (signal.SIGINT, signal.SIGTERM):
+        """Turn a signal into a request. A second SIGINT kills as usual; of the others a queue may
+        send several."""
+        for number in STOPPING:
             signal.signal(number, self._ask_to_stop)
 
     def _ask_to_stop(self, number: int, frame: FrameType | None) -> None:
         self.stop_asked = True
-        signal.signal(number, signal.SIG_DFL)
+        if number == signal.SIGINT:
+            signal.signal(number, signal.SIG_DFL)
 
     def say(self, line: str) -> None:
         self._echo(line)
 
     def update(self, stage: str, step: int, steps: int, note: str = "") -> None:
         """After every step of a stage; waits here while another cell is timed."""
-        self.quiet.pass_by()
         now = time.monotonic()
+        if now - self._passed >= STEP_S / 4:  # the lock takes longer than a small step's losses
+            self.quiet.pass_by()
+            now = self._passed = time.monotonic()
         if now - self._last < self._every_s and step < steps:
             return
         self._last = now

@@ -152,21 +152,24 @@ def test_status_and_report_go_on(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "text", [b"", b"[]", b"3", b"{}", bytes(range(256)), b'{"pid": "x", "machine": "%s"}']
 )
-def test_a_damaged_claim_counts_for_a_moment_only(text, tmp_path):
+def test_a_damaged_claim_counts_for_a_moment_only(text, tmp_path, monkeypatch):
+    monkeypatch.setattr(locks, "WRITING_S", 0.1)
     text = text.replace(b"%s", locks._machine().encode())
     (tmp_path / "claim").write_bytes(text)
+    os.utime(tmp_path / "claim", (0, 0))  # however old it seems to be
     assert locks.claimed_by(tmp_path) == {}
-    os.utime(tmp_path / "claim", (time.time() - 60,) * 2)
+    time.sleep(0.15)
     assert locks.claimed_by(tmp_path) is None
     with locks.claim(tmp_path):
         assert locks.claimed_by(tmp_path)["pid"] == os.getpid()
 
 
 @pytest.mark.parametrize("text", ['{"pid": 1, "machine": "elsewhere"}', ""])
-def test_a_claim_of_a_time_that_has_not_come_blocks_nobody(text, tmp_path):
+def test_a_claim_of_a_time_that_has_not_come_blocks_nobody(text, tmp_path, monkeypatch):
+    monkeypatch.setattr(locks, "WRITING_S", 0.1)
+    monkeypatch.setattr(locks, "LEASE_S", 0.1)
     (tmp_path / "claim").write_text(text)
     os.utime(tmp_path / "claim", (time.time() + 24 * 3600,) * 2)
-    assert locks.claimed_by(tmp_path) is None
     with locks.claim(tmp_path):
         pass
 
@@ -226,6 +229,19 @@ def saved(tmp_path):
     (cell,) = cells(1)
     checkpoint.save(tmp_path / "last.pt", 7, *parts(), cell)
     return cell, tmp_path / "last.pt"
+
+
+def test_one_that_saw_more_gpus_is_continued_on_fewer(saved, monkeypatch):
+    cell, path = saved
+    state = torch.load(path)
+    state["rng_cuda"] = [torch.tensor([n], dtype=torch.uint8) for n in range(3)]
+    torch.save(state, path)
+    assert checkpoint.restore(path, cell, *parts()) == 7
+    found = []
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda drawn, gpu: found.append((gpu, drawn)))
+    checkpoint.restore(path, cell, *parts())
+    assert found == [(0, torch.tensor([0], dtype=torch.uint8))]
 
 
 def test_a_checkpoint_of_another_cell_is_not_continued(saved):

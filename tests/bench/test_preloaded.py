@@ -42,14 +42,14 @@ def test_it_takes_signals(tmp_path):
 
 
 LAUNCHING = """
-import os, sys, time
+import json, os, sys, time
 from pathlib import Path
 from mtl_bench.bench.preloaded import Forked
-from mtl_bench.core.locks import LAUNCHER
+from mtl_bench.core.locks import LAUNCHER, process as this
 
 words = ["train", "--recipe", "scales", "--method", "fixed", "--runs", sys.argv[1]]
 words += ["--set", "recipe.optim.steps=1000000"]
-process = Forked(words, Path(sys.argv[2]), {**os.environ, LAUNCHER: str(os.getpid())})
+process = Forked(words, Path(sys.argv[2]), {**os.environ, LAUNCHER: json.dumps(this())})
 print(process.pid, flush=True)
 time.sleep(600)
 """

@@ -184,10 +184,8 @@ def test_rows_of_a_grid_have_todays_status(cell, directory, tmp_path):
 # --- claims ---------------------------------------------------------------------------------------
 
 
-def write_claim(directory, pid, machine=None, age_s=0.0):
-    owner = {"pid": pid, "machine": machine or locks._machine()}
-    (directory / "claim").write_text(json.dumps(owner))
-    os.utime(directory / "claim", (time.time() - age_s,) * 2)
+def write_claim(directory, pid):
+    (directory / "claim").write_text(json.dumps(locks.process(pid)))
 
 
 def dead_pid():
@@ -223,20 +221,6 @@ def test_claim_of_a_killed_process_nobody_waited_for_is_void(directory):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.wait()
-
-
-def test_claim_of_another_machine_is_void_ten_minutes_after_it_was_renewed(directory):
-    write_claim(directory, 1, "elsewhere", age_s=500)
-    assert locks.claimed_by(directory) is not None
-    write_claim(directory, 1, "elsewhere", age_s=700)
-    assert locks.claimed_by(directory) is None
-
-
-def test_half_written_claim_counts_for_a_moment(directory):
-    (directory / "claim").write_text("")
-    assert locks.claimed_by(directory) == {}
-    os.utime(directory / "claim", (time.time() - 60,) * 2)
-    assert locks.claimed_by(directory) is None
 
 
 # --- provenance -----------------------------------------------------------------------------------

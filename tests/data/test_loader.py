@@ -158,6 +158,20 @@ def test_a_worker_that_the_system_ends_is_one_line(tree, monkeypatch):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_worker_leaves_a_queues_signals_to_the_main_process(tree, number):
+    """Slurm sends them to every process of a cell, which is to save what it has."""
+    before = set(multiprocessing.active_children())
+    batches = train_batches(open_tree(tree), batch_size=3, seed=5, workers=2)
+    next(batches)
+    workers = set(multiprocessing.active_children()) - before
+    assert len(workers) == 2
+    for worker in workers:
+        os.kill(worker.pid, number)
+    assert len(list(islice(batches, 4))) == 4
+    batches.close()
+
+
 def test_a_bug_in_a_worker_keeps_its_traceback(tree, monkeypatch):
     def fail(*given):
         raise RuntimeError("a bug")

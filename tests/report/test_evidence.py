@@ -10,12 +10,20 @@ from scipy import stats
 from mtl_bench.evaluate.delta import log_gain
 from mtl_bench.report import evidence
 from mtl_bench.report.evidence import (
+    ahead,
+    behind_front,
     bootstrap,
     compare,
+    expected_best,
     holm,
     iqm,
+    profile,
+    rank_bands,
+    ranks,
     sign_flip,
     stratified_t,
+    student,
+    suite_mean,
     superiority,
 )
 
@@ -85,7 +93,8 @@ def test_bootstrap_draws_all_lines_together():
     """Two lines whose difference is the same in every run: so it is in every resample."""
     first = RNG.normal(0, 5, (3, 5))
     both = np.stack([first, first + 2])
-    for drawn in evidence.resampled(both, 50, 0):
+    (chunk,) = evidence.resampled(both, 50, 0)
+    for drawn in chunk:
         assert np.allclose(drawn[1] - drawn[0], 2)
         for problem in range(3):
             assert set(drawn[0, problem]) <= set(first[problem])
@@ -179,6 +188,93 @@ def test_a_missing_run_leaves_out_its_block_and_a_failed_one_does_not():
     assert found.difference.mean == FAILED
     assert found.superior == pytest.approx(10 / 11)
     assert not found.within
+
+
+def test_students_test_is_scipys_and_leaves_out_what_it_cannot_judge():
+    d = RNG.normal(1, 1, 5)
+    assert student(d) == stats.ttest_1samp(d, 0).pvalue
+    assert [student(np.full(3, value)) for value in (0.0, 0.1)] == [1, 0]
+    unknown = [np.array([]), np.array([1.0]), np.array([1.0, 2, FAILED])]
+    assert all(math.isnan(student(d)) for d in unknown)
+
+
+def test_who_leads_a_control_has_a_p_by_holm_and_an_interval_above_0():
+    control = RNG.normal(0, 5, 6)
+    shifts = np.array([3.0, -3.0, 0.35, 0.0])[:, None]
+    lines = np.concatenate([control + shifts + RNG.normal(0, 0.3, (4, 6)), np.full((1, 6), NAN)])
+    p = [stats.ttest_rel(line, control).pvalue for line in lines[:4]]
+    assert p[2] < 0.05 < min(1, 2 * p[2])  # significant, and not among four
+    assert ahead(lines, control) == [True, False, False, False, False]
+    assert ahead(lines[2:3], control) == [True]
+
+
+# --- the suite ------------------------------------------------------------------------------------
+
+
+def test_profile_counts():
+    x = np.array([[1.0, 2, NAN], [3, FAILED, 2]])
+    assert profile(x, np.array([0, 1, 2, 3])).tolist() == [0.8, 0.6, 0.2, 0]
+
+
+def test_expected_best_is_the_mean_over_all_draws():
+    scores = np.array([3.0, 1, 2, 5, 2])  # with a tie
+    for budget in (1, 2, 3, 4, 5):
+        draws = itertools.product(scores, repeat=budget)
+        expected = np.mean([max(draw) for draw in draws])
+        assert expected_best(scores)[budget - 1] == pytest.approx(expected)
+
+
+def test_distance_to_a_front():
+    front = np.array([[0.0, 4], [2, 2], [4, 0]])
+    assert behind_front(np.array([1.0, 1]), front) == 1  # one more in both reaches (2, 2)
+    assert behind_front(np.array([2.0, 2]), front) == 0
+    assert behind_front(np.array([5.0, 5]), front) < 0
+    assert behind_front(np.array([FAILED, FAILED]), front) == -FAILED
+    for tasks in (2, 3):
+        front, point = RNG.normal(0, 1, (6, tasks)), RNG.normal(0, 1, tasks)
+        steps = np.arange(-4, 4, 0.001)
+        free = [not (front > point + step).all(1).any() for step in steps]
+        assert behind_front(point, front) == pytest.approx(steps[free.index(True)], abs=0.0011)
+
+
+def test_ranks_are_scipys_means_over_ties():
+    assert ranks(np.array([3.0, 1, 3, FAILED])).tolist() == [1.5, 3, 1.5, 4]
+    several = ranks(np.array([[3.0, 2, NAN], [FAILED, FAILED, 1]]))
+    assert np.nan_to_num(several).tolist() == [[1, 2, 0], [2.5, 2.5, 1]]
+
+
+def test_the_mean_of_a_suite_weighs_problems_alike():
+    score = np.array([[[1.0, 3, NAN], [8, 8, 8]], [[1, 1, 1], [NAN, NAN, NAN]]])
+    assert suite_mean(score)[0] == 5
+    assert math.isnan(suite_mean(score)[1])
+    assert suite_mean(np.array([[[1.0, FAILED]]])) == FAILED
+
+
+def test_rank_bands_are_the_ends_over_all_choices():
+    """Brute force: every definition with every problem left out, every resample of the seeds."""
+    first, second = RNG.normal(0, 1, (2, 4, 3, 2))
+    first[1, 0, 1], first[2, 2, 0], second[1, 0, 1] = FAILED, NAN, FAILED
+    choices, seeds = rank_bands([first, second], resamples=4000)
+
+    def ranked(score):
+        means = [np.mean([np.nanmean(row) for row in line]) for line in score]
+        return [1 + sum(o > m for o in means) + (means.count(m) - 1) / 2 for m in means]
+
+    kept = [[0, 1, 2], [1, 2], [0, 2], [0, 1]]
+    every = np.array([ranked(s[:, problems]) for s in (first, second) for problems in kept])
+    assert choices.tolist() == np.stack([every.min(0), every.max(0)], 1).tolist()
+    whole = np.nan_to_num(first, nan=0.5)  # without it, some resamples lack a line
+    _, seeds = rank_bands([whole], resamples=4000)
+    draws = itertools.product(itertools.product(range(2), repeat=2), repeat=3)
+    drawn = [ranked(np.stack([whole[:, m, list(d[m])] for m in range(3)], 1)) for d in draws]
+    ends = np.percentile(drawn, [2.5, 97.5], axis=0, method="inverted_cdf").T
+    assert np.abs(seeds - ends).max() <= 0.5
+
+
+def test_a_line_that_lacks_every_run_has_no_rank():
+    choices, seeds = rank_bands([np.array([[[1.0, 2]], [[NAN, NAN]]])], resamples=20)
+    assert choices[0].tolist() == seeds[0].tolist() == [1, 1]
+    assert np.isnan([choices[1], seeds[1]]).all()
 
 
 # --- coverage -------------------------------------------------------------------------------------

@@ -379,13 +379,24 @@ def test_stairs_have_the_best_that_can_be_had_at_a_speed(better, heights):
         axes.plot(*zip(*points, strict=True), "o")
         axes.set_xlim(0, 5)
         axes.set_ylim(0, 9)
-        plots.draw_front(axes, points, better)
+        plots.draw_front(axes, points, (+1, better))
     line = axes.lines[-1]
     xs, ys = line.get_data()
     assert line.get_drawstyle() == "steps-pre"
     assert (axes.get_xlim(), axes.get_ylim()) == ((0, 5), (0, 9))
     at = [ys[np.searchsorted(xs[1:], speed) + 1] for speed in (0.5, 1.7, 3.0)]
     assert [*at, ys[-1]] == heights  # a step has the height of its right end
+
+
+def test_stairs_of_what_is_less_the_better_go_from_the_right_edge():
+    points = [(1, 3.0), (2, 2.0), (4, 1.0), (3, 2.5)]
+    with style.styled():
+        axes = style.Figure().add_subplot()
+        axes.plot(*zip(*points, strict=True), "o")
+        axes.set_xlim(0, 5)
+        axes.set_ylim(0, 9)
+        plots.draw_front(axes, points, (-1, -1))
+    assert axes.lines[-1].get_xydata().tolist() == [[5, 1], [4, 1], [2, 2], [1, 3], [1, 9]]
 
 
 def test_files_have_no_more_than_the_grid_needs(built):

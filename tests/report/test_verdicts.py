@@ -8,7 +8,8 @@ import pytest
 from fake_rows import failed_row, make_row
 
 from mtl_bench.report import grid as report
-from mtl_bench.report.verdicts import forest, judge, notes, section, sentence
+from mtl_bench.report.verdict_plots import forest
+from mtl_bench.report.verdicts import judge, notes, sections, sentence
 
 LINES = {"fixed": 0.0, "ahead": 3.0, "same": 0.0, "behind": -4.0}
 
@@ -47,14 +48,14 @@ def test_lines_are_told_apart_although_seeds_spread_wider():
     assert found.lines[0].comparison.difference.mean == pytest.approx(3, abs=0.4)
     assert found.lines[0].step_x == 2.5
     assert sentence(found) == (
-        "3 lines against fixed: 1 better (at 2.50 times its step time), 1 equivalent within 1 "
-        "point, 1 worse, 0 open."
+        "1 of 3 lines beat fixed (at 2.50 times its step time), 1 is equivalent within 1 point, "
+        "1 is worse, 0 are open."
     )
 
 
 def test_two_recipes_are_two_problems_of_one_line():
     found = judge(suite(range(4), ("small", "other")), "method", "fixed")
-    assert (found.problems, found.seeds) == (2, 4)
+    assert (found.problems, found.scores.seeds) == (("small", "other"), (0, 1, 2, 3))
     assert {line.comparison.blocks for line in found.lines} == {8}
 
 
@@ -114,22 +115,25 @@ def test_a_failed_run_is_told_in_table_and_picture(tmp_path):
         if (row["method"], row["seed"]) in {("ahead", 1), ("fixed", 2), ("same", 2)}:
             row |= {"status": "failed", "metric": {}, "error": "NaN"}
     found = judge(rows, "method", "fixed")
-    shown = {line.cells[0].text: line.cells[2].text for line in section(found).lines}
+    shown = {line.cells[0].text: line.cells[2].text for line in sections(found)[0].lines}
     assert shown == {"ahead": "failed", "same": "failed", "behind": "control failed", "fixed": ""}
     assert forest(found, tmp_path, "forest") is None
     rest = [row for row in rows if row["seed"] != 2]
     caption = forest(judge(rest, "method", "fixed"), tmp_path, "forest")
-    assert caption.endswith("Not drawn, as runs failed: ahead.")
+    assert caption.endswith(
+        "0 of 3 lines beat fixed, 1 is equivalent within 1 point, 0 are worse, 2 are open."
+    )
+    assert ">1 failed<" in (tmp_path / "forest.svg").read_text()
 
 
 def test_the_page_the_tables_and_the_picture_have_it(tmp_path):
     page = report.build(grid_of("fixed"), suite(range(8)), tmp_path).read_text()
     assert "Against fixed" in page
-    assert page.count("<p>3 lines against fixed: 1 better") == 1
+    assert page.count("<p>1 of 3 lines beat fixed") == 1
     assert (tmp_path / "forest.png").stat().st_size > 5000
     tables = {name: (tmp_path / name).read_text() for name in ("table.md", "table.tex")}
     assert "| better |" in tables["table.md"]
-    assert r"\caption{Against fixed. 3 lines against fixed: 1 better" in tables["table.tex"]
+    assert r"\caption{Against fixed. 1 of 3 lines beat fixed" in tables["table.tex"]
     head = (tmp_path / "table.csv").read_text().splitlines()[0].split(",")
     assert {"gain", "gain_std"} <= set(head)
 
@@ -138,4 +142,5 @@ def test_the_picture_of_many_lines_is_drawn(tmp_path):
     many = {f"method_{n}": float(n % 7 - 3) for n in range(30)}
     found = judge(suite(range(6), **many), "method", "fixed")
     assert "Paired differences to fixed" in forest(found, tmp_path, "forest")
-    assert len(section(found).lines) == len(found.lines) + 1
+    (section,) = sections(found)
+    assert len(section.lines) == len(found.lines) + 1

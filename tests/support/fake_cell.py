@@ -13,23 +13,31 @@ import time
 from pathlib import Path
 
 from mtl_bench.bench import store
+from mtl_bench.core import locks
 from mtl_bench.core.files import write_json
 from mtl_bench.core.locks import CLAIMED, ClaimedError, claim
+
+if "TEST_LEASE_S" in os.environ:
+    locks.LEASE_S = float(os.environ["TEST_LEASE_S"])
+    locks.BEAT_S = locks.LEASE_S / 8
 
 
 def note(directory: Path, word: str) -> None:
     threads = os.environ.get("OMP_NUM_THREADS", "-")
     with (directory.parent / "history.txt").open("a") as file:
-        file.write(f"{word} {directory.name} {time.time()} {threads} {os.getpid()}\n")
+        gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "-")
+        file.write(f"{word} {directory.name} {time.time()} {threads} {os.getpid()} {gpu}\n")
 
 
 def interrupt(number, frame):
+    signal.signal(number, signal.SIG_IGN)  # a queue may send it again
     raise KeyboardInterrupt
 
 
 def main() -> None:
     action, seconds, code, file, *options = sys.argv[1:]
     signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGUSR1, interrupt)
     directory = Path(file).parent
     if action == "silent":
         sys.exit(0)
@@ -43,7 +51,8 @@ def main() -> None:
             write_json(directory / "code.json", json.loads(code))
             state = {"stage": "train", "step": 1, "steps": 2, "seconds": 1.0, "note": "loss 1"}
             write_json(directory / "progress.json", state)
-            time.sleep(float(seconds))
+            again = (directory / "saved").exists()
+            time.sleep(0 if action == "resume" and again else float(seconds))
             if action == "fail":
                 store.write_failure(directory, "ValueError: on purpose", "Traceback ...")
                 sys.exit(1)
@@ -58,6 +67,7 @@ def main() -> None:
         sys.exit(CLAIMED)
     except KeyboardInterrupt:
         note(directory, "saved")
+        (directory / "saved").touch()
         sys.exit(130)
 
 

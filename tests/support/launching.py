@@ -37,5 +37,4 @@ def history(runs):
 
 def hold(directory, pid):
     directory.mkdir(parents=True, exist_ok=True)
-    owner = {"pid": pid, "machine": locks._machine()}
-    (directory / "claim").write_text(json.dumps(owner))
+    (directory / "claim").write_text(json.dumps(locks.process(pid)))

@@ -46,12 +46,12 @@ def test_a_cell_a_core_is_the_default_on_the_cpu(cores, expected, monkeypatch):
     monkeypatch.setattr("mtl_bench.core.provenance.cores", lambda: cores)
     cells = load_grid("backbones")
     assert len(cells.jobs) == 4
-    assert grid._side_by_side(cells, cells.jobs, Device.cpu) == expected
+    assert grid._side_by_side(cells, cells.jobs, grid._gpus(cells, Device.cpu)) == expected
 
 
 def test_a_grid_of_timings_runs_alone():
     timings = load_grid("latency", smoke=True)
-    assert grid._side_by_side(timings, timings.jobs, Device.cpu) == 1
+    assert grid._side_by_side(timings, timings.jobs, ()) == 1
 
 
 def test_threads_do_not_spin_long_unless_the_user_says_so(monkeypatch):

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor, nn
 
+from mtl_bench.bench.space import check as check_space
 from mtl_bench.core.method import (
     GradientMethod,
     LookAheadMethod,
@@ -245,10 +246,12 @@ def _hard_jacobians(size: float) -> dict[str, Tensor]:
 
 
 def _space(kind: type[Method]) -> None:
-    """What may be tuned are hyper-parameters."""
+    """What may be tuned are hyper-parameters, and their values lie where trials can draw them."""
     unknown = set(kind.space) - set(inspect.signature(kind).parameters)
     if unknown:
         raise ValueError(f"space has {sorted(unknown)}, which the constructor does not take")
+    for key, where in kind.space.items():
+        check_space(key, where)
 
 
 def _replayable(kind: type[Method]) -> None:

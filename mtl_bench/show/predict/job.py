@@ -244,7 +244,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise ValueError(f"{out} exists and is not an empty folder: name a new one, or remove it")
-    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    partial = out.with_name(f".{out.name}.partial-{os.urandom(6).hex()}")
     partial.mkdir(parents=True)
     try:
         yield partial
@@ -287,7 +287,7 @@ def recorded(job: Job, path: Path | None) -> Iterator[None]:
     why = missing()
     if why:
         raise ValueError(why)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.urandom(6).hex()}.tmp")
     try:
         job.recording = Recording(temporary, job.predictor.labels)
         yield
