@@ -236,6 +236,31 @@ def test_of_a_grid_only_its_jobs_are_packed(other, tmp_path):
     assert not (tmp_path / "none.xz").exists()
 
 
+def test_failures_travel_where_they_are_asked_for(other, tmp_path):
+    """A tuned grid counts them: without them a pack would not tell which trials are left."""
+    pack, runs, cell = tmp_path / "rows.xz", tmp_path / "runs", cell_of("fixed", 7)
+    for seed, code in ((7, provenance.code(cell)), (8, {})):
+        directory = store.run_dir(cell_of("fixed", seed), other)
+        directory.mkdir()
+        write_json(directory / "cell.json", to_dict(cell_of("fixed", seed)))
+        write_json(directory / "code.json", code)
+        write_json(directory / "failed.json", {"error": "NaN at step 7"})
+    lines = run("--pack", pack, "--failures", "--runs", other).splitlines()
+    assert lines[0].startswith("packed 5 of")
+    assert lines[1].startswith("left out, stale: 1 (")
+    run(pack, "--runs", runs)
+    state = store.stored(cell, runs)
+    assert (state.word, state.why) == ("failed", "NaN at step 7")
+    assert "already here: 5 (tried here, too)" in run(pack, "--runs", runs)
+    runs = tmp_path / "more"
+    run(other, "--failures", "--runs", runs)
+    assert store.status(cell, runs) == "failed"
+    write(tmp_path / "third", cell)
+    run(tmp_path / "third", "--runs", runs)
+    assert store.status(cell, runs) == "done"
+    assert "tried here, too" in run(pack, "--runs", runs)
+
+
 @pytest.mark.parametrize("harm", ["cut", "flipped", "other words", "newer", "no lines"])
 def test_a_damaged_or_foreign_pack_is_one_line_and_takes_nothing(harm, other, tmp_path):
     pack, runs = tmp_path / "rows.xz", tmp_path / "runs"
