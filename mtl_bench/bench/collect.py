@@ -16,6 +16,7 @@ from typing import Any
 
 from mtl_bench.bench import store
 from mtl_bench.bench.jobs import Job, Timing, kind_of, load_cell
+from mtl_bench.core import provenance
 from mtl_bench.core.config import Cell, to_travel
 from mtl_bench.core.files import read_json, replacing, write_json, write_text
 from mtl_bench.core.locks import ClaimedError, claim
@@ -26,6 +27,7 @@ FORMAT = {"format": "mtl-bench rows", "version": 1}
 CURVE = "curve.csv"
 BESIDE = (CURVE, "env.json", "samples.npz")  # what a report reads, and what ran
 WEIGHTS = ("taken.json", "code.json", "last.pt")  # the last: what is there is whole
+FAILED = ("code.json", "failed.json")
 PRESET = 6 | lzma.PRESET_EXTREME  # a window of 8 MiB, some hundred rows
 KINDS: dict[str, type[Job]] = {"cell": Cell, "timing": Timing}  # a line's key -> what is in it
 NAMED = 3  # of those that were left out, for each reason
@@ -33,10 +35,11 @@ NAMED = 3  # of those that were left out, for each reason
 
 @dataclass(frozen=True)
 class Found:
-    """A job's result elsewhere."""
+    """A job's result elsewhere, or how it failed."""
 
     job: Job
-    row: dict[str, Any]
+    row: dict[str, Any]  # of a failed cell empty
+    failed: Mapping[str, Any] = field(default_factory=dict)  # FAILED -> what these files say
     beside: Mapping[str, Path | str] = field(default_factory=dict)  # files, or their text
 
     @property
@@ -56,15 +59,18 @@ class Left:
 # --- reading --------------------------------------------------------------------------------------
 
 
-def from_folder(runs: Path, weights: bool = False) -> Iterator[Found | Left]:
+def from_folder(
+    runs: Path, weights: bool = False, failures: bool = False
+) -> Iterator[Found | Left]:
     """What is in a runs folder, by name.
 
     Args:
         weights: take checkpoints along.
+        failures: take cells, too, that failed by the code of today.
     """
     for path in sorted(runs.iterdir()):
         if (path / "cell.json").is_file() or (path / "row.json").is_file():
-            yield _readable(path.name, partial(_of_cell, path, weights))
+            yield _readable(path.name, partial(_of_cell, path, weights, failures))
     for path in sorted((runs / "latency").glob("*.json")):
         yield _readable(f"latency/{path.stem}", partial(_of_timing, path))
 
@@ -76,13 +82,16 @@ def _readable(name: str, read: Callable[[], Found | Left]) -> Found | Left:
         return Left(name, "unreadable", " ".join(str(error).split()))
 
 
-def _of_cell(directory: Path, weights: bool) -> Found | Left:
+def _of_cell(directory: Path, weights: bool, failures: bool) -> Found | Left:
     cell = load_cell(directory / "cell.json")
     row = store.read_row(directory / "row.json", cell)
     if row is None:
-        failure = read_json(directory / "failed.json")
-        kind = "unfinished" if failure is None else "failed"
-        return Left(directory.name, kind, str((failure or {}).get("error", "")))
+        files = {name: read_json(directory / name) for name in FAILED}
+        failed = {name: values for name, values in files.items() if values is not None}
+        if failures and len(failed) == len(FAILED):
+            return _judged(Found(cell, {}, failed))
+        why = str(failed.get("failed.json", {}).get("error", ""))
+        return Left(directory.name, "failed" if "failed.json" in failed else "unfinished", why)
     names = [*BESIDE, *(WEIGHTS if weights else ())]
     beside = {name: directory / name for name in names if (directory / name).is_file()}
     if CURVE in beside:
@@ -91,7 +100,7 @@ def _of_cell(directory: Path, weights: bool) -> Found | Left:
         from mtl_bench.train import checkpoint  # takes seconds, for torch
 
         checkpoint.require(directory / "last.pt", cell)
-    return _judged(Found(cell, row, beside))
+    return _judged(Found(cell, row, beside=beside))
 
 
 def _of_timing(path: Path) -> Found | Left:
@@ -106,6 +115,9 @@ def _of_timing(path: Path) -> Found | Left:
 
 def _judged(found: Found) -> Found | Left:
     """As the store judges a row: done by the code of today, or not."""
+    if found.failed:
+        changed = store.changed(found.failed["code.json"], found.job)
+        return Left(found.name, "stale", provenance.in_words(changed)) if changed else found
     state = store.state_of(found.row, found.job)
     return found if state.word == "done" else Left(found.name, state.word, state.why)
 
@@ -125,9 +137,12 @@ def _of_line(values: Mapping[str, Any]) -> Found | Left:
     if kind is None or not isinstance(row := values.get("row"), dict):
         raise ValueError("no job with its row")
     job = from_dict(KINDS[kind], values[kind])
+    failed = {name: values[name] for name in FAILED if isinstance(values.get(name), dict)}
+    if len(failed) == len(FAILED):
+        return _judged(Found(job, {}, failed))
     if wrong := store.fault(row, job):
         raise ValueError(f"the row is {wrong}")
-    return _judged(Found(job, row, {CURVE: values[CURVE]} if CURVE in values else {}))
+    return _judged(Found(job, row, beside={k: values[k] for k in (CURVE,) if k in values}))
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
@@ -168,7 +183,7 @@ def write_pack(path: Path, jobs: Iterable[Found], curves: bool = False) -> None:
             own = {"cell": to_travel(job)} if isinstance(job, Cell) else {"timing": to_dict(job)}
             log = found.beside.get(CURVE)
             kept = {CURVE: log.read_bytes().decode()} if curves and isinstance(log, Path) else {}
-            write({**own, "row": found.row, **kept})
+            write({**own, "row": found.row, **found.failed, **kept})
 
 
 def put(found: Found, runs: Path) -> Left | None:
@@ -198,6 +213,8 @@ def _put_timing(found: Found, runs: Path) -> Left | None:
 
 def _put_cell(found: Found, runs: Path) -> Left | None:
     directory, here = store.run_dir(found.job, runs), store.stored(found.job, runs)
+    if found.failed and here.word != "missing":
+        return Left(found.name, "already here", "tried here, too")
     if here.word == "done" and here.row != found.row:
         return Left(found.name, "already here")
     lacking = [name for name in found.beside if not (directory / name).is_file()]
@@ -209,7 +226,9 @@ def _put_cell(found: Found, runs: Path) -> Left | None:
         lacking = list(found.beside)
     for name in lacking:
         _copy(found.beside[name], directory / name)
-    if here.word != "done":
+    for name, values in found.failed.items():
+        write_json(directory / name, values)
+    if here.word != "done" and not found.failed:
         write_json(directory / "row.json", found.row)  # last: it is what makes a result
     return None
 
@@ -225,7 +244,9 @@ def _copy(source: Path | str, to: Path) -> None:
 # --- both -----------------------------------------------------------------------------------------
 
 
-def collect(sources: Iterable[Path], runs: Path, weights: bool = False) -> tuple[int, list[Left]]:
+def collect(
+    sources: Iterable[Path], runs: Path, weights: bool = False, failures: bool = False
+) -> tuple[int, list[Left]]:
     """Take all that fits from runs folders and packs; how many were taken, and the rest.
 
     Raises:
@@ -241,7 +262,8 @@ def collect(sources: Iterable[Path], runs: Path, weights: bool = False) -> tuple
             pass  # a damaged file is told before half of it is in
     taken, left = 0, []
     for source in sources:
-        for each in from_folder(source, weights) if source.is_dir() else read_pack(source):
+        folder = source.is_dir()
+        for each in from_folder(source, weights, failures) if folder else read_pack(source):
             why = each if isinstance(each, Left) else put(each, runs)
             taken += why is None
             left += [] if why is None else [why]
@@ -249,7 +271,11 @@ def collect(sources: Iterable[Path], runs: Path, weights: bool = False) -> tuple
 
 
 def pack(
-    path: Path, runs: Path, jobs: Iterable[Job] | None = None, curves: bool = False
+    path: Path,
+    runs: Path,
+    jobs: Iterable[Job] | None = None,
+    curves: bool = False,
+    failures: bool = False,
 ) -> tuple[int, list[Left]]:
     """Write a pack of what is done in a runs folder; how many jobs, and what was left out.
 
@@ -259,7 +285,7 @@ def pack(
     Raises:
         ValueError: there is none.
     """
-    every = list(from_folder(runs)) if runs.is_dir() else []
+    every = list(from_folder(runs, failures=failures)) if runs.is_dir() else []
     if jobs is not None:
         names = {job.slug for job in jobs}
         every = [each for each in every if each.name in names]

@@ -27,6 +27,12 @@ def collect(
     weights: Annotated[
         bool, typer.Option("--weights", help="Of runs folders take checkpoints, too.")
     ] = False,
+    failures: Annotated[
+        bool,
+        typer.Option(
+            "--failures", help="Cells that failed, too; a tuned grid counts them as worst trials."
+        ),
+    ] = False,
     pack: Annotated[
         Path | None,
         typer.Option(
@@ -73,15 +79,15 @@ def collect(
         missing = next((source for source in sources if not source.exists()), None)
         if missing is not None:
             raise ValueError(f"no runs folder or pack '{missing}'")
-        taken, left = collecting.collect(sources, runs, weights)
+        taken, left = collecting.collect(sources, runs, weights, failures)
         typer.echo(f"collected {taken} into {runs}")
     else:
         if sources or weights:
             word = "--weights" if weights else f"'{(sources or [])[0]}'"
             raise ValueError(f"{word} does not go with --pack, which packs what is in --runs")
         choice = Choice(grid, recipe, seeds, smoke, settings, pretrained) if grid else None
-        jobs = None if choice is None else choice.needed()
-        packed, left = collecting.pack(pack, runs, jobs, curves)
+        jobs = None if choice is None else choice.needed(runs)
+        packed, left = collecting.pack(pack, runs, jobs, curves, failures)
         typer.echo(f"packed {packed} of {runs} in {pack}, {pack.stat().st_size / 1024:.0f} KiB")
     for line in collecting.told(left):
         typer.echo(line)

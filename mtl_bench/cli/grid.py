@@ -310,13 +310,11 @@ class Choice:
             say=partial(typer.echo, err=True),
         )
 
-    def needed(self) -> "Sequence[Job]":
-        """The jobs, and all that they and their deltas need."""
-        from mtl_bench.bench import references
+    def needed(self, runs: Path) -> "Sequence[Job]":
+        """The jobs that are known by now, trials among them, and all that these need."""
         from mtl_bench.bench.jobs import with_parents
 
-        grid = self.load()
-        return with_parents([*grid.jobs, *references.baselines(grid)])
+        return with_parents(_named(self.load(), runs)[0])
 
     @property
     def command(self) -> str:

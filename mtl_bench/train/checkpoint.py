@@ -66,7 +66,8 @@ def read(path: Path, lazily: bool = False) -> dict[str, Any]:
         ValueError: no such file, not a checkpoint, or one of another format.
     """
     if not path.is_file():
-        raise ValueError(f"no checkpoint {path}")
+        row = path.with_name("row.json").is_file()
+        raise ValueError(f"no checkpoint {path}" + "; mtl-bench collect --weights brings it" * row)
     if not zipfile.is_zipfile(path):
         why = "it is no file of torch.save, or cut off" if path.stat().st_size else "it is empty"
         raise ValueError(f"{path} is not a readable checkpoint: {why}; {REMEDY}")

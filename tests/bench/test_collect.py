@@ -19,6 +19,7 @@ from mtl_bench.core import files, provenance
 from mtl_bench.core.config import Cell, Recipe, load_recipe
 from mtl_bench.core.files import read_json, write_json
 from mtl_bench.core.plain import to_dict
+from mtl_bench.train import checkpoint
 
 METHODS = ("fixed", "nash", "rlw")
 
@@ -143,8 +144,6 @@ def test_a_good_result_takes_the_place_of_what_is_none_and_nothing_trained_is_lo
 
 
 def test_weights_come_where_they_are_asked_for_also_later(other, tmp_path, monkeypatch):
-    from mtl_bench.train import checkpoint
-
     monkeypatch.setattr(checkpoint, "require", lambda path, cell: None)
     runs = tmp_path / "runs"
     run(other, "--runs", runs)
@@ -168,6 +167,8 @@ def test_a_stale_row_without_weights_is_not_trained_again_unasked(other, tmp_pat
     write_json(runs / cell.slug / "row.json", row)
     with pytest.raises(ValueError, match=r"evaluate: harness changed, and .*last.pt is not here"):
         store.can_renew(cell, runs)
+    with pytest.raises(ValueError, match=r"no checkpoint .*last.pt; mtl-bench collect --weights"):
+        checkpoint.read(runs / cell.slug / "last.pt")
     row["code"]["train"]["harness"] = "another"
     write_json(runs / cell.slug / "row.json", row)
     assert not store.can_renew(cell, runs)  # what there was would be of no use
@@ -233,6 +234,31 @@ def test_of_a_grid_only_its_jobs_are_packed(other, tmp_path):
     text = run("--pack", tmp_path / "none.xz", "--grid", grid, "--runs", other, code=2)
     assert "nothing to pack" in text
     assert not (tmp_path / "none.xz").exists()
+
+
+def test_failures_travel_where_they_are_asked_for(other, tmp_path):
+    """A tuned grid counts them: without them a pack would not tell which trials are left."""
+    pack, runs, cell = tmp_path / "rows.xz", tmp_path / "runs", cell_of("fixed", 7)
+    for seed, code in ((7, provenance.code(cell)), (8, {})):
+        directory = store.run_dir(cell_of("fixed", seed), other)
+        directory.mkdir()
+        write_json(directory / "cell.json", to_dict(cell_of("fixed", seed)))
+        write_json(directory / "code.json", code)
+        write_json(directory / "failed.json", {"error": "NaN at step 7"})
+    lines = run("--pack", pack, "--failures", "--runs", other).splitlines()
+    assert lines[0].startswith("packed 5 of")
+    assert lines[1].startswith("left out, stale: 1 (")
+    run(pack, "--runs", runs)
+    state = store.stored(cell, runs)
+    assert (state.word, state.why) == ("failed", "NaN at step 7")
+    assert "already here: 5 (tried here, too)" in run(pack, "--runs", runs)
+    runs = tmp_path / "more"
+    run(other, "--failures", "--runs", runs)
+    assert store.status(cell, runs) == "failed"
+    write(tmp_path / "third", cell)
+    run(tmp_path / "third", "--runs", runs)
+    assert store.status(cell, runs) == "done"
+    assert "tried here, too" in run(pack, "--runs", runs)
 
 
 @pytest.mark.parametrize("harm", ["cut", "flipped", "other words", "newer", "no lines"])

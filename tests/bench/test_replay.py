@@ -41,7 +41,8 @@ def test_mean_weights_are_reproduced_to_the_float_and_the_parent_runs_once(metho
     assert "replay" not in rows[0]["cell"]
     written = (place.runs / parent.slug / "row.json").stat().st_mtime_ns
 
-    for mode in ("shuffled", "final", "level"):
+    modes = ("shuffled", "level") if method == "nash" else ("final",)
+    for mode in modes:
         said.clear()
         place.run(replace(cell, replay=mode))
         assert not any("first" in line for line in said)
@@ -52,7 +53,9 @@ def test_mean_weights_are_reproduced_to_the_float_and_the_parent_runs_once(metho
         assert len(np.unique(own)) > 3
         mean = own.mean(0, np.float64).astype(np.float32)
         assert (weights(place, cell, prefix) == mean).all()
-        assert (weights(place, replace(cell, replay="final"), prefix) == own[-1]).all()
+        if "final" in modes:
+            assert (weights(place, replace(cell, replay="final"), prefix) == own[-1]).all()
+            continue
         level = own.mean(1, np.float64, keepdims=True).astype(np.float32)
         assert (weights(place, replace(cell, replay="level"), prefix) == level).all()
         shuffled = weights(place, replace(cell, replay="shuffled"), prefix)
