@@ -226,8 +226,10 @@ SHARED: dict[str, type] = {"kind": str, "question": str, "axes": dict, "skip": l
 KINDS: dict[str, tuple[Kind[Any], dict[str, type]]] = {  # a file's `kind` -> its keys
     "training": (
         CELLS,
-        {"recipe": str, "smoke_recipe": str, "row": list, "baseline": dict, "report": dict}
-        | {"suite": list, "tune": dict},
+        {
+            **{"recipe": str, "smoke_recipe": str, "suite": list, "row": list},
+            **{"baseline": dict, "tune": dict, "report": dict},
+        },
     ),
     "latency": (TIMINGS, {"smoke": dict, "weights": dict, "quality": dict}),
 }
@@ -438,7 +440,8 @@ class _CellPoints(Points):
 
     def make(self, values: dict[str, Any], row: int) -> Cell:
         """Its values, then `--set`, then what multiplies a number."""
-        places, start = (("row", row), ("axes", 0)), self.start
+        places: tuple[Place, ...] = (("row", row), ("axes", 0))
+        start = self.start
         recipe = values.pop("recipe", None)
         if recipe is not None:
             try:
