@@ -5,7 +5,7 @@ Cells of different status never share a line, and neither do measured, trivial a
 
 import itertools
 import tomllib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ from mtl_bench.core.style import MANY
 from mtl_bench.report import columns as known
 from mtl_bench.report import curves, pictures, plots, protocol, trials, tuned, verdict_plots
 from mtl_bench.report.columns import (
-    DELTA,
     ONLY,
     RELATIVE,
     Row,
@@ -32,7 +31,7 @@ from mtl_bench.report.columns import (
     per_class,
     text,
 )
-from mtl_bench.report.delta import counted
+from mtl_bench.report.footnotes import footnotes
 from mtl_bench.report.page import PAGE, Figure, Page, beside, figures_of, render
 from mtl_bench.report.statistics import (
     SHOWN,
@@ -69,7 +68,6 @@ AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single
 VERDICTS, TRIALS = "verdicts", "trials"  # stems of their files
 WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples", "extremes")
 TRAINED_BRIEFLY = "Cells marked smoke were trained for a few steps to show that the pipeline works."
-NUMERALS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
 @dataclass(frozen=True)
@@ -382,89 +380,6 @@ def _records(results: Results) -> Iterator[dict[str, Any]]:
         yield named | {"n": "0"}
 
 
-# --- what a reader must know ----------------------------------------------------------------------
-
-
-def footnotes(results: Results) -> Iterator[str]:
-    """One sentence or two for each thing that occurs in the table; `+-` stands for the sign."""
-    groups = results.groups
-    if results.control is not None:
-        yield (
-            f"Mean +- sample standard deviation over n seeds. Bold: ahead of {results.control}, by "
-            "differences paired by seed: their 95 % interval is on the better side of 0, and p is "
-            "at most 0.05 by Holm over the other lines (Student's test)."
-        )
-    elif any(len(group.rows) > 1 for group in groups):
-        floor = ", and of the trivial predictor by more than its own" if results.baseline else ""
-        yield (
-            "Mean +- sample standard deviation over n seeds. Bold: ahead of every other plain line "
-            f"by more than either's spread{floor}."
-        )
-    if any(len(group.rows) == 1 for group in [g for g in groups if not g.mark] or groups):
-        yield (
-            "n = 1: one seed has no spread, so a lead by it or over it cannot be told from chance, "
-            "and nothing is bold."
-        )
-    if any(len(group.rows) < results.seeds for group in groups):
-        yield f"{FEWER} Fewer seeds than another line: mean and spread are not over the same."
-    if any(0 < e.count < len(g.rows) for g in groups for e in g.entries.values()):
-        yield "A number with its own n is the mean over those seeds that have the value."
-    if DELTA[0] in results.columns():
-        yield from _delta(results)
-    if results.reference is not None:
-        yield from _relative(results, results.reference)
-    if results.baseline and results.tasks():
-        yield _trivial(results.tasks())
-    stale = [row for group in groups if group.status == "stale" for row in group.rows]
-    if stale:
-        why = ", ".join(dict.fromkeys(str(row["error"]) for row in stale if row.get("error")))
-        because = f" ({why})" if why else ""
-        yield f"Stale: code changed after these cells ran{because}; run again with --rerun stale."
-    if any(group.smoke for group in groups):
-        yield "Smoke: a few training steps that show that the pipeline works. Not a result."
-
-
-def _delta(results: Results) -> Iterator[str]:
-    rows = [row for group in results.groups for row in group.rows]
-    own = [row for row in rows if "delta_baseline" in row]
-    against = " or ".join(dict.fromkeys(str(row["delta_baseline"]) for row in own))
-    metrics = counted(rows)
-    tasks = list(dict.fromkeys(column.task for column in metrics))
-    joint = ", and " if len(metrics) > len(tasks) else ", "
-    named = joint.join(_named([c for c in metrics if c.task == task]) for task in tasks)
-    of = f" of {results.problem}" if results.problem else ""
-    over = f"Delta{of}: over {named}, relative to the baseline ({against}) of the same seed."
-    defined = (
-        f"Flat: mean relative loss over the {_count(metrics)} metrics, so that "
-        "less is better and a negative one is a gain. Task: mean relative gain, first over a "
-        f"task's metrics and then over the {_count(tasks)} tasks, so that more is better. "
-        "Log gain: likewise, of the ratios' logarithms, so that a halved and a doubled error weigh "
-        "the same. The baseline's own is 0 by definition and not shown"
-    )
-    bold = "." if results.control is not None else "; bold is ahead of it, too."
-    yield from (over, defined + bold) if of else (f"{over} {defined}{bold}",)
-
-
-def _named(metrics: Sequence[Column]) -> str:
-    """The titles, with what was done to all of them before: `median-scaled A, B and C`."""
-    titles = [column.title for column in metrics]
-    if not metrics[0].note:
-        return ", ".join(titles)
-    joined = " and ".join(filter(None, (", ".join(titles[:-1]), titles[-1])))
-    return f"{metrics[0].note} {joined}"
-
-
-def _count(things: Sequence[Any]) -> str:
-    return NUMERALS[len(things)] if len(things) < len(NUMERALS) else str(len(things))
-
-
-def _relative(results: Results, reference: str) -> Iterator[str]:
-    if any(group.entries[column.name].count for group in results.groups for column in RELATIVE):
-        yield f"x of {reference}: a line's mean over that of the line '{reference}'."
-    else:
-        yield f"Nothing is relative to '{reference}': no such line has numbers."
-
-
 # --- the report -----------------------------------------------------------------------------------
 
 
@@ -641,12 +556,6 @@ def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, 
 def _curve(path: Path) -> pd.DataFrame:
     found: pd.DataFrame = pd.DataFrame(read_curve(path)).apply(pd.to_numeric)
     return found
-
-
-def _trivial(tasks: Collection[str]) -> str:
-    made = " and ".join(sorted(quality.words("trivial", tasks)))
-    note = f"Trivial predictor: the training split's {made}. It looks at no image; a network has to"
-    return " ".join([f"{note} beat it.", *quality.words("trivial_note", tasks)])
 
 
 def counted_images(results: Results) -> Section | None:

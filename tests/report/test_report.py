@@ -19,7 +19,8 @@ from mtl_bench.report import grid as report
 from mtl_bench.report import pictures, protocol, readme
 from mtl_bench.report import table as formats
 from mtl_bench.report.columns import OF_CONTROL, column, figures, headlines
-from mtl_bench.report.grid import fill, footnotes, tabulate
+from mtl_bench.report.footnotes import footnotes
+from mtl_bench.report.grid import fill, tabulate
 from mtl_bench.report.statistics import SMOKE
 
 

@@ -18,7 +18,8 @@ from mtl_bench.report import curves, delta, plots, protocol
 from mtl_bench.report import grid as report
 from mtl_bench.report import table as formats
 from mtl_bench.report.columns import column
-from mtl_bench.report.grid import Layout, fill, footnotes, tabulate
+from mtl_bench.report.footnotes import footnotes
+from mtl_bench.report.grid import Layout, fill, tabulate
 
 NAMED = Layout(rows="name")
 ABLATION = {

@@ -13,7 +13,7 @@ from fake_rows import GRID, make_row, write_runs
 from mtl_bench.bench.jobs import CELLS
 from mtl_bench.core import config, plugins, quality
 from mtl_bench.core.columns import Column
-from mtl_bench.report import delta, grid, latency, readme
+from mtl_bench.report import delta, footnotes, grid, latency, readme
 
 NORMALS = """
 from dataclasses import dataclass
@@ -128,7 +128,7 @@ def test_every_plot_is_drawn(built):
 
 
 def test_a_trivial_predictor_says_what_it_is():
-    assert grid._trivial({"panoptic", "depth", "slopes"}).startswith(
+    assert footnotes._trivial({"panoptic", "depth", "slopes"}).startswith(
         "Trivial predictor: the training split's mean depth image and mean normal and most "
         "frequent class per pixel."
     )
