@@ -137,8 +137,8 @@ def ablate(
     if not quiet or dry_run:
         _announce(chosen, todo, runs, given)
     if where is On.slurm:
-        passed_on = ["--wandb", wandb.value, "--device", device.value, "--quiet"]
-        _queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run)
+        passed_on = ["--wandb", wandb.value, "--device", device.value, *["--quiet"] * quiet]
+        _queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run, quiet)
         return
     if dry_run:
         typer.echo("nothing was run (--dry-run)")
@@ -430,6 +430,7 @@ def _queue(
     cap: int | None,
     rerun: str | None,
     dry_run: bool,
+    quiet: bool,
 ) -> None:
     """Hand what nobody runs or has queued to Slurm. What they train on is rendered before, once."""
     from mtl_bench.bench import jobs as kinds
@@ -449,7 +450,7 @@ def _queue(
         typer.echo("nothing was queued (--dry-run)")
         return
     queue.check()  # before anything is made ready
-    roots = {cell.recipe.data: o.data_root(cell, data, quiet=True) for cell in cells}
+    roots = {cell.recipe.data: o.data_root(cell, data, quiet) for cell in cells}
 
     def command(cell: Cell) -> list[str]:
         return kinds.cell_command(cell, runs, roots[cell.recipe.data], options)
