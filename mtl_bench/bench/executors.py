@@ -51,7 +51,7 @@ class Executor(Protocol):
 
 
 @dataclass
-class Processes:
+class Processes(Executor):
     """Processes of this machine, started at once. It tells the end of each once, and forgets it."""
 
     _running: dict[str, "subprocess.Popen[bytes] | Forked"] = field(default_factory=dict)

@@ -239,7 +239,7 @@ class Launcher:
         smoke: stands in the rows of timings.
         data: those that cells run on.
         gpus: that cells are spread over, see `gpu_pool`: one each, and several on one only where
-            there are more `jobs`. None: the processes see what this one sees.
+            there are more `jobs`. Empty: the processes see what this one sees.
     """
 
     runs: Path
@@ -499,7 +499,7 @@ class Here:
 
     def _run(self, cell: Cell, rerun: bool, stale: bool) -> None:
         directory = store.run_dir(cell, self.runs)
-        if store.inspect(cell, self.runs).why == store.ELSEWHERE:
+        if (owner := locks.claimed_by(directory)) and not locks.is_here(owner):
             self.echo(f"{directory} is claimed {store.ELSEWHERE}: watching whether that one lives")
         with locks.claim(directory):
             if rerun:

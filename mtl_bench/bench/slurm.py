@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mtl_bench.bench.executors import Status, Task
+from mtl_bench.bench.executors import Executor, Status, Task
 from mtl_bench.core.files import read_json, write_json, write_text
 from mtl_bench.core.locks import CLAIMED
 
@@ -82,7 +82,7 @@ def options_of(text: str) -> dict[str, str]:
 
 
 @dataclass
-class Slurm:
+class Slurm(Executor):
     """The queue of a cluster.
 
     Args:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mtl_bench.cli import options as o
+from mtl_bench.cli.queue import queue
 from mtl_bench.core.config import Cell
 
 if TYPE_CHECKING:
@@ -140,9 +141,9 @@ def ablate(
         _announce(chosen, first, runs, rerun, given)
     steps = itertools.chain([first], (_left(each, runs, rerun, given) for each in phases))
     if where is On.slurm:
-        passed_on = ["--wandb", wandb.value, "--device", device.value, "--quiet"]
+        passed_on = ["--wandb", wandb.value, "--device", device.value, *["--quiet"] * quiet]
         todo = next(filter(None, steps), [])
-        _queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run)
+        queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run, quiet)
         if chosen.tune and todo and not dry_run:
             typer.echo("once they are done, the same command queues what follows from them")
         return
@@ -511,53 +512,6 @@ def _run(
             runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given, gpus=gpus
         )
         launcher.run(todo)
-
-
-def _queue(
-    todo: "Sequence[Job]",
-    runs: Path,
-    data: Path | None,
-    given: "Data",
-    options: list[str],
-    sbatch: Mapping[str, str],
-    cap: int | None,
-    rerun: str | None,
-    dry_run: bool,
-) -> None:
-    """Hand what nobody runs or has queued to Slurm. What they train on is rendered before, once."""
-    from mtl_bench.bench import jobs as kinds
-    from mtl_bench.bench import launch, store
-    from mtl_bench.bench.executors import Task
-    from mtl_bench.bench.slurm import FOLDER, Slurm, arrays
-
-    queue = Slurm(runs, sbatch, cap)
-    states = {} if dry_run else queue.states()
-    busy = [cell for cell in todo if store.status(cell, runs) == "running"]
-    busy += [cell for cell in todo if cell.id in states and states[cell.id].word != "ended"]
-    cells = [cell for cell in todo if isinstance(cell, Cell) and cell not in busy]
-    if dry_run:
-        shape = [Task(cell.id, (), runs, tuple(each.id for each in cell.parents)) for cell in cells]
-        for number, array in enumerate(arrays(shape)):
-            typer.echo(queue.script(runs.resolve() / FOLDER / f"TOKEN{number}", len(array)))
-        typer.echo("nothing was queued (--dry-run)")
-        return
-    queue.check()  # before anything is made ready
-    roots = {cell.recipe.data: o.data_root(cell, data, quiet=True) for cell in cells}
-
-    def command(cell: Cell) -> list[str]:
-        return kinds.cell_command(cell, runs, roots[cell.recipe.data], options)
-
-    queue.submit(launch.queued_tasks(cells, runs, command, rerun, given))
-    numbers = " ".join(map(str, queue.submitted))
-    if busy:
-        typer.echo(f"{len(set(busy))} cells run or are queued already")
-    if cells:
-        typer.echo(
-            f"queued {len(cells)} cells as Slurm's jobs {numbers}; `status` shows them, "
-            f"`scancel {numbers}` ends them, and once they are done `report` writes the report"
-        )
-    else:
-        typer.echo("nothing to queue")
 
 
 def _rows(grid: "Grid", runs: Path, data: "Data | None" = None) -> list[dict[str, Any]]:
