@@ -34,16 +34,17 @@ def queue(
 
     slurm = Slurm(runs, sbatch, cap)
     states = {} if dry_run else slurm.states()
-    busy = [cell for cell in todo if store.status(cell, runs) == "running"]
-    busy += [cell for cell in todo if cell.id in states and states[cell.id].word != "ended"]
-    cells = [cell for cell in todo if isinstance(cell, Cell) and cell not in busy]
+    busy = {cell.id for cell in todo if store.status(cell, runs) == "running"}
+    busy |= {cell.id for cell in todo if cell.id in states and states[cell.id].word != "ended"}
+    cells = [cell for cell in todo if isinstance(cell, Cell) and cell.id not in busy]
     if dry_run:
         shape = [Task(cell.id, (), runs, tuple(each.id for each in cell.parents)) for cell in cells]
         for number, array in enumerate(arrays(shape)):
             typer.echo(slurm.script(runs.resolve() / FOLDER / f"TOKEN{number}", len(array)))
         typer.echo("nothing was queued (--dry-run)")
         return
-    slurm.check()  # before anything is made ready
+    if cells:
+        slurm.check()  # before anything is made ready
     roots = {cell.recipe.data: o.data_root(cell, data, quiet) for cell in cells}
 
     def command(cell: Cell) -> list[str]:
@@ -52,7 +53,7 @@ def queue(
     slurm.submit(launch.queued_tasks(cells, runs, command, rerun, given))
     numbers = " ".join(map(str, slurm.submitted))
     if busy:
-        typer.echo(f"{len(set(busy))} cells run or are queued already")
+        typer.echo(f"{len(busy)} cells run or are queued already")
     if cells:
         typer.echo(
             f"queued {len(cells)} cells as Slurm's jobs {numbers}; `status` shows them, "

@@ -244,7 +244,6 @@ def test_a_refusal_is_one_line_and_leaves_nothing_queued(node, tmp_path):
 
 GRID = """
 recipe = "smoke"
-baseline = ""
 [axes]
 method = ["fixed"]
 backbone = ["tiny"]
