@@ -565,7 +565,7 @@ def _argument(annotation: ast.expr | None, written: ast.expr | None) -> Argument
         default = ... if inner is None else ast.literal_eval(inner)
     of = type(default) if type(default) in PLAIN.values() else Any
     kind = of if annotation is None else _type(annotation)
-    return Argument(kind, "" if written is None else ast.unparse(written), default)
+    return Argument(kind, "" if inner is None else ast.unparse(inner), default)
 
 
 def _type(node: ast.expr) -> Any:
