@@ -212,7 +212,7 @@ def _section(card: Card) -> str:
     notes = [f"Source: <{card.url}>." if card.url else ""]
     notes += [f"Needs {', '.join((card.needs, *card.extras))}." if card.needs else ""]
     notes += [f"Hyper-parameters: {settings}." if settings else ""]
-    known = plugins.attributes("methods", card.about.name) if card.needs else {}
+    known = plugins.attributes_of(card.about.path) if card.needs else {}
     drawn = ", ".join(
         _code(f"{key} = {json.dumps(where)}") for key, where in known.get("space", {}).items()
     )

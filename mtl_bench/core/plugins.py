@@ -195,7 +195,10 @@ def stem_and_field(task: str) -> tuple[str, str]:
 
 
 def _files_in(folder: Path, name: str) -> list[Path]:
-    return sorted([*folder.glob(f"{name}.py"), *folder.glob(f"{name}/__init__.py")])
+    """Links that lead nowhere, too, of which a list tells that they are broken."""
+    if name == ANY:
+        return sorted([*folder.glob(f"{name}.py"), *folder.glob(f"{name}/__init__.py")])
+    return [p for p in (folder / f"{name}.py", folder / name / "__init__.py") if os.path.lexists(p)]
 
 
 def name_of(path: Path) -> str:
@@ -323,7 +326,12 @@ def attributes(kind: str, name: str) -> dict[str, Any]:
     Raises:
         ValueError: an unknown or ambiguous name.
     """
-    return dict(_attributes(content(path_of(kind, name))))
+    return attributes_of(path_of(kind, name))
+
+
+def attributes_of(path: Path) -> dict[str, Any]:
+    """The same of a plug-in's file."""
+    return dict(_attributes(content(path)))
 
 
 @functools.cache

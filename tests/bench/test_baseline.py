@@ -32,7 +32,7 @@ def command(tmp_path, monkeypatch):
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
     monkeypatch.setattr("mtl_bench.bench.references.measure_trivial", lambda *given, **named: None)
     page = "mtl_bench.report.grid.build"
-    monkeypatch.setattr(page, lambda grid, rows, out, **given: out / "index.html")
+    monkeypatch.setattr(page, lambda grid, rows, out, *given: out / "index.html")
 
     def run(*words, code=0, **behaviour):
         made = fake(tmp_path / "runs", **behaviour)

@@ -12,7 +12,7 @@ from mtl_bench.bench.jobs import with_parents
 from mtl_bench.cli import grid as commands
 from mtl_bench.cli.app import app
 from mtl_bench.core import plugins
-from mtl_bench.core.config import Cell
+from mtl_bench.core.config import Cell, load_recipe
 
 
 @pytest.fixture
@@ -256,4 +256,5 @@ def test_a_result_is_against_the_tuned_baseline_of_its_seed_and_a_failure_stands
             final.cell.slug for final in tuning.finals(grid, runs) if final.line == "single-task"
         }
         assert store.load_row(runs / baseline["slug"]) is not None
-        assert row["cell"]["recipe"]["optim"]["lr"] == 5e-3  # the grid's: lines are its own
+        published = load_recipe("conflict").optim.lr
+        assert row["cell"]["recipe"]["optim"]["lr"] == published  # the grid's: lines are its own

@@ -195,7 +195,7 @@ def ablate(tmp_path, monkeypatch):
     monkeypatch.setattr(options, "data_root", lambda *given: tmp_path)
     monkeypatch.setattr("mtl_bench.bench.references.measure_trivial", lambda *given, **named: None)
 
-    def build(grid, rows, out_dir, **given):
+    def build(grid, rows, out_dir, *given):
         built.append((grid.name, [row["status"] for row in rows], out_dir))
         run.rows = rows
         return out_dir / "index.html"

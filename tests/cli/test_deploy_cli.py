@@ -47,7 +47,7 @@ def test_a_row_is_written_and_printed(tmp_path):
         (["--size", "32x64"], "either --checkpoint RUN or --backbone NAME"),
         ([*SMALL, "--tasks", "dept"], "no task called 'dept'"),
         ([*SMALL, "--size", "32"], "'32' is not HxW"),
-        ([*SMALL, "--size", "30x64"], "multiples of 8"),
+        ([*SMALL, "--size", "30x64"], "not divisible by the deepest stride 8"),
         ([*SMALL, "--engine", "eager", "--precision", "fp16", "--device", "cpu"], "it has fp32"),
         (["--checkpoint", "nowhere"], "no run or checkpoint 'nowhere'"),
     ],

@@ -11,10 +11,19 @@ import pytest
 
 from mtl_bench.bench.check import check
 from mtl_bench.bench.grid import load_grid
+from mtl_bench.bench.tuning import trials
 from mtl_bench.report import readme
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+
+
+def write_example(kind, name, marker, tmp_path, monkeypatch):
+    (source,) = [example for example in EXAMPLES if marker in example]
+    folder = tmp_path / kind
+    folder.mkdir()
+    (folder / f"{name}.py").write_text(source)
+    monkeypatch.setenv("MTL_BENCH_PLUGINS", str(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -22,23 +31,25 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     [("methods", "power_mean", "LossMethod"), ("backbones", "resnet34", "TimmBackbone")],
 )
 def test_example_passes_the_checks(kind, name, marker, tmp_path, monkeypatch):
-    (source,) = [example for example in EXAMPLES if marker in example]
-    folder = tmp_path / kind
-    folder.mkdir()
-    (folder / f"{name}.py").write_text(source)
-    monkeypatch.setenv("MTL_BENCH_PLUGINS", str(tmp_path))
+    write_example(kind, name, marker, tmp_path, monkeypatch)
     failed = [f"{r.name}: {r.detail}" for r in check(kind, name) if not r.ok]
     assert failed == []
 
 
-def test_the_example_grid_loads(tmp_path):
-    (source,) = re.findall(r"```toml\n(.*?)```", README.read_text(), re.DOTALL)
-    path = tmp_path / "mine.toml"
-    path.write_text(source)
-    grid = load_grid(str(path))
+def test_the_example_grids_load(tmp_path, monkeypatch):
+    write_example("methods", "power_mean", "LossMethod", tmp_path, monkeypatch)
+    plain, tuned = tmp_path / "plain.toml", tmp_path / "tuned.toml"
+    sources = re.findall(r"```toml\n(.*?)```", README.read_text(), re.DOTALL)
+    for path, source in zip((plain, tuned), sources, strict=True):
+        path.write_text(source)
+    grid = load_grid(str(plain))
     assert len(grid.cells) == 6
     assert set(grid.names.values()) == {"Fixed", "Uncertainty, longer warm-up"}
     assert {cell.recipe.optim.warmup_steps for cell in grid.cells} == {20, 100}
+    grid = load_grid(str(tuned))
+    assert {cell.method for cell in grid.cells} >= {"power_mean", "scalarised"}
+    assert len(grid.cells) == 3 * 6 * 5
+    assert len(trials(grid)) == 3 * 7 * 6
 
 
 def test_every_linked_file_exists():
