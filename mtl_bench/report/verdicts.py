@@ -169,17 +169,15 @@ def sections(found: Verdicts, tune: Any = None) -> list[Section]:
 
 
 def sentence(found: Verdicts) -> str:
-    """What the whole comparison says, in one sentence."""
+    """What the whole comparison says, in one sentence: counts, and what it costs."""
     total, control = len(found.lines), found.control.label
     of = {word: [x for x in found.lines if x.comparison.verdict == word] for word in VERDICTS}
-    cost = [line.step_x for line in of["better"] if not math.isnan(line.step_x)]
-    at = f" (at {np.median(cost):.2f} times its step time)" if cost else ""
     suite = f" over {len(found.problems)} problems" if len(found.problems) > 1 else ""
     return (
         f"{len(of['better'])} of {total} line{'s' * (total > 1)} beat{'s' * (total == 1)} "
-        f"{control}{suite}{at}, {len(of['equivalent'])} {_are(of['equivalent'])} equivalent within "
-        f"{evidence.MARGIN:g} point, {len(of['worse'])} {_are(of['worse'])} worse, "
-        f"{len(of['open'])} {_are(of['open'])} open."
+        f"{control}{suite}{_at(of['better'])}, {len(of['equivalent'])} {_are(of['equivalent'])} "
+        f"equivalent within {evidence.MARGIN:g} point{_at(of['equivalent'])}, {len(of['worse'])} "
+        f"{_are(of['worse'])} worse, {len(of['open'])} {_are(of['open'])} open{_lacking(found)}."
     )
 
 
@@ -195,8 +193,10 @@ def protocol(found: Verdicts, tune: Any = None) -> str:
     blocks = max(line.comparison.blocks for line in found.lines)
     seeds = ", ".join(map(str, found.scores.seeds))
     several = f" x {len(found.problems)} problems" if len(found.problems) > 1 else ""
+    if tune is not None:
+        budget = f"{note(tune)} Intervals are over the results' seeds, not over other trials."
     return (
-        f"{budget if tune is None else note(tune)} Results: seeds {seeds}{several}, n = {blocks} "
+        f"{budget} Results: seeds {seeds}{several}, n = {blocks} "
         f"blocks; family: {len(found.lines)} line{'s' * (len(found.lines) > 1)} against "
         f"{found.control.label}, sign-flip test, two-sided, by Holm at "
         f"{1 - evidence.LEVEL:.2g}; margin of equivalence: {evidence.MARGIN:g} point."
@@ -213,7 +213,7 @@ def untested(control: str, lines: Sequence[str]) -> str:
         return f"Nothing is tested against '{control}': no such line{did_you_mean(control, lines)}."
     return (
         f"Nothing is tested against '{control}': it takes two seeds or problems in which this line "
-        "and another have a log gain; the baseline of the gain has none."
+        "and another have a log gain. The baseline of the gain has none; stale runs do not count."
     )
 
 
@@ -231,8 +231,9 @@ def notes(found: Verdicts) -> list[str]:
         f"Differences are paired by problem and seed ({made}, n = {blocks} blocks); their interval "
         "is Student's, over the given problems. p: sign-flip test, two-sided, by Holm over the "
         f"family of {len(found.lines)} lines. Equivalent: the 90 % interval lies inside "
-        f"+-{evidence.MARGIN:g} point. IQM: mean of the middle half of a line's own gains, with a "
-        "bootstrap over seeds.",
+        f"+-{evidence.MARGIN:g} point. P(X>Y): share of blocks in which the line is ahead. IQM: "
+        "mean of the middle half of a line's own gains, with a bootstrap over seeds at 95 %, which "
+        "covers about 91 % with five.",
         f"Rank: by mean gain, {found.control.label} among the lines; below it the range over "
         "definitions of the delta (log gain, flat, by task)"
         f"{' and left-out problems' * several}, and the middle 95 % over resampled seeds.",
@@ -243,10 +244,14 @@ def notes(found: Verdicts) -> list[str]:
             "seeds, of all by the sign-flip test. Verdicts hold for these problems; the last "
             "columns leave out each of them in turn."
         )
-    if any(line.comparison.blocks < blocks for line in found.lines):
+    if any(has_fewer(line, found) for line in found.lines):
         said.append(
             f"{FEWER} Fewer blocks than another line: runs are missing, and a line without any run "
             "of a problem has no rank."
+        )
+    if any(np.isfinite(d.mean) and np.isnan(d.low) for d in _differences(found)):
+        said.append(
+            "No interval: a single run of a problem has no spread. Such a line is never equivalent."
         )
     failed = sum(line.comparison.failed for line in found.lines)
     if failed:
@@ -289,6 +294,11 @@ def band(line: Line) -> tuple[float, float]:
     """The best and the worst rank of a line by any choice or draw."""
     both = (line.chosen, line.drawn)
     return min(low for low, _ in both), max(high for _, high in both)
+
+
+def has_fewer(line: Line, found: Verdicts) -> bool:
+    """Whether runs of a line are missing that another has."""
+    return line.comparison.blocks < max(each.comparison.blocks for each in found.lines)
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -351,7 +361,6 @@ def _ratio(step_MN: Array, control_MN: Array) -> float:
 def _over_all(found: Verdicts, tune: Any) -> Section:
     """A line each: difference with its interval, P(X > Y), p by Holm, verdict, rank, cost."""
     control = found.control.label
-    most = max(line.comparison.blocks for line in found.lines)
     heads = (
         Head("line", left=True),
         Head("blocks"),
@@ -368,7 +377,7 @@ def _over_all(found: Verdicts, tune: Any) -> Section:
     return Section(
         heading=f"Against {control}",
         heads=heads,
-        lines=(*(_table_row(line, most) for line in found.lines), own),
+        lines=(*(_table_row(line, found) for line in found.lines), own),
         source=f"{sentence(found)} {protocol(found, tune)}",
         caption=" ".join(
             [f"Against {control}.", sentence(found), protocol(found, tune), *notes(found)]
@@ -403,21 +412,21 @@ def _by_problem(found: Verdicts) -> Section:
 def _stands(line: Line, problems: Sequence[str]) -> str:
     """Whether the verdict stays, whatever problem is left out."""
     own = line.comparison.verdict
-    other = [
-        f"{each.verdict} without {problem}"
-        for problem, each in zip(problems, line.without, strict=True)
-        if each.verdict != own
-    ]
-    return ", ".join(other) or f"{own}, whichever"
+    other: dict[str, list[str]] = {}
+    for problem, each in zip(problems, line.without, strict=True):
+        if each.verdict != own:
+            other.setdefault(each.verdict, []).append(problem)
+    said = [f"{verdict} without {' or '.join(without)}" for verdict, without in other.items()]
+    return "; ".join(said) or f"{own}, whichever"
 
 
-def _table_row(line: Line, most: int) -> TableRow:
+def _table_row(line: Line, found: Verdicts) -> TableRow:
     each = line.comparison
     of, p = each.difference, each.p_holm
     between = "-" if np.isnan(of.low) else f"{_signed(of.low)} ... {_signed(of.high)}"
     return TableRow.of(
         line.label,
-        f"{each.blocks}{FEWER * (each.blocks < most)}",
+        f"{each.blocks}{FEWER * has_fewer(line, found)}",
         Cell(_marked(each), bold=each.verdict == "better", value=of.mean),
         between,
         f"{each.superior:.2f}",
@@ -447,6 +456,24 @@ def _rank(line: Line) -> Cell:
         return Cell("-")
     best, worst = band(line)
     return Cell(f"{line.rank:g}", f"({best:g} ... {worst:g})", value=line.rank)
+
+
+def _differences(found: Verdicts) -> list[Estimate]:
+    return [line.comparison.difference for line in found.lines]
+
+
+def _at(lines: Sequence[Line]) -> str:
+    """What lines cost, where it is known."""
+    cost = [line.step_x for line in lines if not math.isnan(line.step_x)]
+    median = " in the median" * (len(cost) > 1)
+    return f" (at {np.median(cost):.2f} times its step time{median})" if cost else ""
+
+
+def _lacking(found: Verdicts) -> str:
+    """How many of the lines are judged by some of the runs alone."""
+    count = sum(has_fewer(line, found) for line in found.lines)
+    lines = f"{count} line{'s' * (count > 1)} lack{'s' * (count == 1)} runs ({FEWER})"
+    return f"; {lines}" if count else ""
 
 
 def _are(lines: Sequence[Line]) -> str:
