@@ -13,11 +13,20 @@ from scipy import stats
 
 from mtl_bench.core import style
 from mtl_bench.report import grid as report
+from mtl_bench.report import verdict_plots
 from mtl_bench.report.grid import Layout, by_problem, fill, tabulate
 from mtl_bench.report.page import beside
 from mtl_bench.report.statistics import FEW
 from mtl_bench.report.verdict_plots import LEADERS, bands, forest, highlighted, profiles
-from mtl_bench.report.verdicts import ALL, judge, notes, records, sections, sentence
+from mtl_bench.report.verdicts import (
+    ALL,
+    VERDICTS,
+    judge,
+    notes,
+    records,
+    sections,
+    sentence,
+)
 
 LINES = {"ahead": 3.0, "same": 0.0, "behind": -3.0, "far": -60.0, "a_line_with_a_long_name": 0.05}
 
@@ -67,7 +76,8 @@ def test_the_whole_is_paired_over_problems_and_each_is_tested_by_its_seeds(rows,
         )
     assert sentence(found) == (
         "1 of 5 lines beat scalarised over 3 problems (at 1.50 times its step time), 2 are "
-        "equivalent within 1 point, 2 are worse, 0 are open."
+        "equivalent within 1 point (at 1.25 times its step time in the median), 2 are worse, 0 are "
+        "open."
     )
 
 
@@ -104,6 +114,7 @@ def test_a_line_that_lacks_a_problem_has_fewer_blocks_and_no_rank(rows):
     assert (row.cells[1].text, row.cells[8].text) == ("10\u2020", "-")
     assert "same" not in [line.label for line in found.ranked]
     assert any("Fewer blocks than another line" in note for note in notes(found))
+    assert sentence(found).endswith("0 are open; 1 line lacks runs (\u2020).")
 
 
 def test_a_problem_without_any_gain_is_none(rows):
@@ -222,6 +233,52 @@ def test_many_lines_stay_legible(tmp_path):
     colors = [look.color for _, look in highlighted(found)]
     assert len(colors) == 35
     assert len(set(colors)) == LEADERS + 2  # and the control's, and gray
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved."""
+    kept = []
+    monkeypatch.setattr(verdict_plots, "save", lambda figure, *_: kept.append(figure))
+    return kept
+
+
+@pytest.mark.parametrize("draw", [forest, bands, profiles])
+def test_a_legend_of_all_verdicts_fits(drawn, tmp_path, draw):
+    lines = {f"method_{i}": (3.0, 0.0, -3.0, 0.8)[i % 4] for i in range(12)}
+    found = judge(suite_rows(lines, noise=1.5), "method", CONTROL)
+    assert {line.comparison.verdict for line in found.lines} == set(VERDICTS)
+    assert draw(found, tmp_path, "figure")
+    (figure,) = drawn
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert (box.x0, box.y0) >= (0, 0)
+    assert box.x1 <= figure.bbox.width
+    assert box.y1 <= figure.bbox.height
+
+
+def test_an_interval_that_goes_on_out_of_view_has_an_arrow(drawn, tmp_path):
+    rows = suite_rows({**{f"method_{i}": i / 10 for i in range(12)}, "far": -40.0, "wide": 0.0})
+    for row in rows:
+        if row["method"] == "wide" and row["seed"] == 0:
+            row["metric"]["delta.gain"] -= 8
+    assert "an arrow: it goes on further out" in forest(
+        judge(rows, "method", CONTROL), tmp_path, "forest"
+    )
+    (axes,) = (axes for axes in drawn[0].axes if axes.get_title() == ALL)
+    marks = {line.get_marker() for line in axes.lines}
+    arrows = [line for line in axes.lines if line.get_marker() == "<"]
+    assert ({"o", "<"} <= marks, len(arrows)) == (True, 2)
+    assert [text.get_text() for text in axes.texts] == ["-40"]
+
+
+def test_profiles_say_how_many_runs_are_out_of_view(tmp_path):
+    rows = suite_rows({**{f"method_{i}": 0.0 for i in range(4)}, "far": -40.0})
+    said = profiles(judge(rows, "method", CONTROL), tmp_path, "profiles")
+    assert "Out of view: 15 below of 90 runs." in said
+    rows = [row for row in rows if row["method"] != "far"]
+    assert "Out of view" not in profiles(judge(rows, "method", CONTROL), tmp_path, "profiles")
 
 
 def test_no_figure_where_there_is_nothing_to_show(tmp_path):
