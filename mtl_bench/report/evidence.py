@@ -286,12 +286,17 @@ def ranks(score_XL: Array) -> Array:
     return np.asarray(stats.rankdata(-score_XL, axis=-1, nan_policy="omit"), float)
 
 
-def suite_mean(score_XMN: Array) -> Array:
-    """Mean over problems of the mean over seeds; NaN for a line that lacks a problem."""
+def seed_mean(score_XMN: Array) -> Array:
+    """Mean over seeds; NaN for a problem without runs."""
     known = ~np.isnan(score_XMN)
     with np.errstate(invalid="ignore"):
-        mean_XM = np.where(known, score_XMN, 0).sum(-1) / known.sum(-1)
-    found: Array = mean_XM.mean(-1)
+        found: Array = np.where(known, score_XMN, 0).sum(-1) / known.sum(-1)
+    return found
+
+
+def suite_mean(score_XMN: Array) -> Array:
+    """Mean over problems of the mean over seeds; NaN for a line that lacks a problem."""
+    found: Array = seed_mean(score_XMN).mean(-1)
     return found
 
 
@@ -302,7 +307,8 @@ def rank_bands(
 
     The choices are how a score is defined and which problem is left out. Of the ranks under
     resampled seeds, drawn jointly for all lines, the band is the middle LEVEL. A rank depends on
-    the lines that are ranked: they are the same throughout, those that have every problem.
+    the lines that are ranked: they are the same throughout, those that have every problem. One
+    that has no run of a problem among the drawn seeds counts there with its mean over all.
 
     Args:
         definitions: scores of the same runs, [L, M, N] each; the first is resampled.
@@ -314,8 +320,9 @@ def rank_bands(
     if problems > 1:
         left_out = (np.delete(s, m, axis=1) for s in definitions for m in range(problems))
         chosen += [suite_mean(score_LMN) for score_LMN in left_out]
-    drawn = resampled(definitions[0], resamples, seed)
-    drawn_SL = np.concatenate([suite_mean(score_SLMN) for score_SLMN in drawn])
+    own_LM = seed_mean(definitions[0])
+    drawn = map(seed_mean, resampled(definitions[0], resamples, seed))
+    drawn_SL = np.concatenate([np.where(np.isnan(m), own_LM, m).mean(-1) for m in drawn])
     tails = [50 * (1 - LEVEL), 50 * (1 + LEVEL)]
     return (
         _ends(ranks(np.stack(chosen)), [0, 100]),

@@ -26,9 +26,10 @@ def footnotes(results: "Results") -> Iterator[str]:
         )
     elif any(len(group.rows) > 1 for group in groups):
         floor = ", and of the trivial predictor by more than its own" if results.baseline else ""
+        where = f" in {results.problem}, where nothing is tested" if results.problem else ""
         yield (
-            "Mean +- sample standard deviation over n seeds. Bold: ahead of every other plain line "
-            f"by more than either's spread{floor}."
+            f"Mean +- sample standard deviation over n seeds. Bold{where}: ahead of every other "
+            f"plain line by more than either's spread{floor}."
         )
     if any(len(group.rows) == 1 for group in [g for g in groups if not g.mark] or groups):
         yield (

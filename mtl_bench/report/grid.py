@@ -275,10 +275,10 @@ def fill(results: Results, short: bool = False) -> Table:
     main = [c for c in results.columns() if c.short or c.headline]
     banner = f"{SMOKE.capitalize()}." if results.smoke else ""
     said = {"Quality": f" {' '.join(notes)}"}
-    lacking = [TableRow.of(c.label, c.status, c.reason, c.slug) for c in results.unfinished]
+    of = f"{results.problem}: " * bool(results.problem)
+    lacking = [TableRow.of(of + c.label, c.status, c.reason, c.slug) for c in results.unfinished]
     why = Head("why", left=True, css=WRAP), Head("folder", left=True, page_only=True)
     heads = (*Head.words("cell", "status"), *why)
-    of = f"{results.problem}: " * bool(results.problem)
     return Table(
         sections=tuple(
             _section(

@@ -58,10 +58,13 @@ def forest(found: Verdicts, out_dir: Path, name: str) -> str | None:
         warn(figure, found)
         save(figure, out_dir, name)
     own = "" if one else " Each panel has its own scale."
+    shown = [c.difference for several in panels.values() for c in several]
+    single = any(np.isfinite(d.mean) and np.isnan(d.low) for d in shown)
+    hollow = " Hollow: a single run of a problem, so that no interval is known." * single
     return (
         f"Paired differences to {found.control.label} with 95 % intervals, more is better; gray: "
         f"the margin of equivalence, {PLUS_MINUS}{evidence.MARGIN:g} point; an arrow: it goes on "
-        f"further out; a number: the mean, where that is out, too.{own} {sentence(found)}"
+        f"further out; a number: the mean, where that is out, too.{hollow}{own} {sentence(found)}"
     )
 
 
@@ -232,7 +235,8 @@ def _intervals(axes: Axes, compared: Sequence[Comparison]) -> None:
             if np.fmax(of.high, of.mean) > right:
                 axes.plot(right, place, ">", **style)
             if mean == of.mean:
-                axes.plot(mean, place, "o", **style)
+                face = "white" if np.isnan(of.low) else color
+                axes.plot(mean, place, "o", markerfacecolor=face, **style)
             else:
                 at, side = (mean + room, "left") if of.mean < left else (mean - room, "right")
                 said = f"{of.mean:+.0f}"

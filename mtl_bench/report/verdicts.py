@@ -20,7 +20,13 @@ from mtl_bench.core.plain import did_you_mean
 from mtl_bench.report import evidence
 from mtl_bench.report.columns import DELTA, Row, column, measured, text
 from mtl_bench.report.evidence import Array, Comparison, Estimate
-from mtl_bench.report.statistics import axes_of, by_recipe, cell_of, own_and_shared
+from mtl_bench.report.statistics import (
+    axes_of,
+    by_recipe,
+    cell_of,
+    own_and_shared,
+    recipe_of,
+)
 from mtl_bench.report.table import FEWER, Cell, Head, Section, TableRow
 from mtl_bench.report.tuned import note
 
@@ -65,6 +71,7 @@ class Verdicts:
     lines: tuple[Line, ...]
     scores: Scores
     smoke: bool
+    left_out: tuple[str, ...]  # recipes in which no run has a gain
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -85,6 +92,7 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
         axis: the field of a cell that names a line.
         control: its value that the others are held against.
     """
+    recipes = by_recipe(rows)
     rows = [row for row in rows if row.get("status", "done") in ("done", "failed")]
     of = scores(rows, axis)
     if control not in of.labels:
@@ -120,7 +128,9 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
     lines = [line for i, line in found.items() if i != at]
     lines.sort(key=lambda line: -np.nan_to_num(line.comparison.difference.mean, nan=-1e9))
     smoke = any(row.get("smoke") for row in rows)
-    return Verdicts(found[at], tuple(lines), of, smoke)
+    judged = {recipe_of(row) for row in rows if not math.isnan(_gain(row))}
+    left_out = tuple(name for name in recipes if name not in judged)
+    return Verdicts(found[at], tuple(lines), of, smoke, left_out)
 
 
 def scores(rows: Sequence[Row], axis: str) -> Scores:
@@ -243,6 +253,11 @@ def notes(found: Verdicts) -> list[str]:
             f"{MARK} p by Holm at most 0.05: of one problem by Student's paired test over its "
             "seeds, of all by the sign-flip test. Verdicts hold for these problems; the last "
             "columns leave out each of them in turn."
+        )
+    if found.left_out:
+        said.append(
+            f"Left out: {', '.join(found.left_out)}, where no run has a log gain yet: either its "
+            "own numbers or its baseline's are missing."
         )
     if any(has_fewer(line, found) for line in found.lines):
         said.append(

@@ -122,7 +122,11 @@ def test_a_problem_without_any_gain_is_none(rows):
     for row in rows:
         if row["cell"]["recipe"]["name"] == "dense":
             row["metric"].pop("delta.gain", None)
-    assert judge(rows, "method", CONTROL).problems == ("scales", "digits")
+        if row["cell"]["recipe"]["name"] == "digits":
+            row.update(status="missing", metric={})
+    found = judge(rows, "method", CONTROL)
+    assert (found.problems, found.left_out) == (("scales",), ("digits", "dense"))
+    assert any(note.startswith("Left out: digits, dense, where no run") for note in notes(found))
 
 
 def test_a_failed_baseline_is_no_line(rows):
@@ -173,7 +177,9 @@ def test_few_lines_keep_their_rule(rows):
     names = ("baseline", CONTROL, "ahead", "behind")
     assert len(names) == FEW
     results = tabulate([row for row in rows if row["method"] in names], layout)
-    assert "ahead of every other plain line" in fill(results).notes[0]
+    assert "Bold: ahead of every other plain line" in fill(results).notes[0]
+    results = tabulate([row for row in rows if row["method"] in names], layout, problem="scales")
+    assert "Bold in scales, where nothing is tested: ahead" in fill(results).notes[0]
 
 
 def test_the_report_has_all_of_it(rows, tmp_path):
@@ -271,6 +277,30 @@ def test_an_interval_that_goes_on_out_of_view_has_an_arrow(drawn, tmp_path):
     arrows = [line for line in axes.lines if line.get_marker() == "<"]
     assert ({"o", "<"} <= marks, len(arrows)) == (True, 2)
     assert [text.get_text() for text in axes.texts] == ["-40"]
+
+
+def test_a_mean_without_an_interval_is_hollow(drawn, tmp_path):
+    rows = [
+        row
+        for row in suite_rows({"one": 0.0, "whole": 0.0})
+        if row["method"] != "one" or row["seed"] == 0
+    ]
+    caption = forest(judge(rows, "method", CONTROL), tmp_path, "forest")
+    assert "Hollow: a single run of a problem" in caption
+    faces = [
+        line.get_markerfacecolor() for line in drawn[0].axes[-1].lines if line.get_marker() == "o"
+    ]
+    assert [face == "white" for face in faces].count(True) == 1
+    rows = [row for row in rows if row["method"] != "one"]
+    assert "Hollow" not in forest(judge(rows, "method", CONTROL), tmp_path, "forest")
+
+
+def test_cells_of_a_suite_without_numbers_name_their_problem(rows):
+    rows = json.loads(json.dumps(rows))
+    fail(rows[0])
+    table = fill(tabulate(rows[:1], Layout(rows="method", control=CONTROL), problem="scales"))
+    (section,) = table.lacking
+    assert section.lines[0].cells[0].text == "scales: baseline, seed 0"
 
 
 def test_profiles_say_how_many_runs_are_out_of_view(tmp_path):
