@@ -84,12 +84,14 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         if many:
             _number(axes, spots)
         save(figure, out_dir, f"{y.name}_{x.name}")
+    spread = any(g.entries[c.name].count > 1 for g in groups for c in (x, y))
+    bars = " Bars: the sample standard deviation over seeds." * spread
     if many:
         far = [f"{g.label} {_short(g, y)} at {_short(g, x)}" for g in outside]
         more = f" Further out: {'; '.join(far)}." if far else ""
-        return f"{y.title} against {x.title}; the numbers are those of the legend.{more}"
+        return f"{y.title} against {x.title}; the numbers are those of the legend.{bars}{more}"
     points = "; ".join(f"{g.label} {_short(g, y)} at {_short(g, x)} {x.title}" for g in groups)
-    return f"{y.title} against {x.title}. {points}."
+    return f"{y.title} against {x.title}. {points}.{bars}"
 
 
 def classes(results: "Results", column: Column, out_dir: Path, name: str) -> str | None:

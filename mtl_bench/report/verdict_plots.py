@@ -134,10 +134,16 @@ def bands(found: Verdicts, out_dir: Path, name: str) -> str | None:
         warn(figure, found)
         save(figure, out_dir, name)
     left_out = " and with each problem left out" if len(found.problems) > 1 else ""
+    without = len(found.lines) + 1 - len(ranked)
+    absent = (
+        f" Absent: {without} line{'s' * (without > 1)} without a run of some problem."
+        if without
+        else ""
+    )
     return (
-        "Ranks by mean gain (point), their range by definition of the delta (log gain, flat, by "
-        f"task){left_out} (line), and the middle 95 % over seeds resampled jointly for all lines "
-        "(bar)."
+        "Ranks by mean gain (point; diamond: the control), their range by definition of the delta "
+        f"(log gain, flat, by task){left_out} (line), and the middle 95 % over seeds resampled "
+        f"jointly for all lines (bar). Colour: the verdict.{absent}"
     )
 
 

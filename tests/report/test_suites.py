@@ -104,7 +104,7 @@ def test_a_verdict_that_hangs_on_one_problem_is_told(rows):
     assert "*" not in scales["a_line_with_a_long_name"].text
 
 
-def test_a_line_that_lacks_a_problem_has_fewer_blocks_and_no_rank(rows):
+def test_a_line_that_lacks_a_problem_has_fewer_blocks_and_no_rank(rows, tmp_path):
     rows = [r for r in rows if (r["method"], r["cell"]["recipe"]["name"]) != ("same", "dense")]
     found = judge(rows, "method", CONTROL)
     line = next(line for line in found.lines if line.label == "same")
@@ -113,6 +113,7 @@ def test_a_line_that_lacks_a_problem_has_fewer_blocks_and_no_rank(rows):
     row = next(x for x in sections(found)[0].lines if x.cells[0].text == "same")
     assert (row.cells[1].text, row.cells[8].text) == ("10\u2020", "-")
     assert "same" not in [line.label for line in found.ranked]
+    assert "Absent: 1 line without a run of some problem." in bands(found, tmp_path, "bands")
     assert any("Fewer blocks than another line" in note for note in notes(found))
     assert sentence(found).endswith("0 are open; 1 line lacks runs (\u2020).")
 
