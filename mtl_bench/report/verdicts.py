@@ -7,13 +7,15 @@ as the worst, a missing one leaves its block out. The other lines are the family
 
 import csv
 import io
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtl_bench.core.columns import Column
 from mtl_bench.core.plain import did_you_mean
@@ -47,6 +49,16 @@ class Scores:
     others: tuple[Array, ...]  # the same by the other definitions of a delta, percent
     step_LMN: Array  # ms; NaN: unknown
 
+    def within(self, chosen_M: NDArray[np.bool_]) -> "Scores":
+        """Those of some problems."""
+        return replace(
+            self,
+            problems=tuple(itertools.compress(self.problems, chosen_M)),
+            gain_LMN=self.gain_LMN[:, chosen_M],
+            others=tuple(other_LMN[:, chosen_M] for other_LMN in self.others),
+            step_LMN=self.step_LMN[:, chosen_M],
+        )
+
 
 @dataclass(frozen=True)
 class Line:
@@ -71,7 +83,7 @@ class Verdicts:
     lines: tuple[Line, ...]
     scores: Scores
     smoke: bool
-    left_out: tuple[str, ...]  # recipes in which no run has a gain
+    left_out: tuple[str, ...]  # problems in which the control has no gain
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -98,6 +110,11 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
     if control not in of.labels:
         return None
     at = of.labels.index(control)
+    has_M = ~np.isnan(of.gain_LMN[at]).all(-1)
+    judged = {recipe_of(row) for row in rows if not math.isnan(_gain(row))}
+    left_out = [name for name in recipes if name not in judged]
+    left_out += itertools.compress(of.problems, ~has_M)
+    of = of.within(has_M)
     gain_LMN = of.gain_LMN
     rest = [i for i in range(len(of.labels)) if i != at]
     compare = partial(_compare, gain_LMN, at)
@@ -128,9 +145,7 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
     lines = [line for i, line in found.items() if i != at]
     lines.sort(key=lambda line: -np.nan_to_num(line.comparison.difference.mean, nan=-1e9))
     smoke = any(row.get("smoke") for row in rows)
-    judged = {recipe_of(row) for row in rows if not math.isnan(_gain(row))}
-    left_out = tuple(name for name in recipes if name not in judged)
-    return Verdicts(found[at], tuple(lines), of, smoke, left_out)
+    return Verdicts(found[at], tuple(lines), of, smoke, tuple(left_out))
 
 
 def scores(rows: Sequence[Row], axis: str) -> Scores:
@@ -220,7 +235,8 @@ def untested(control: str, lines: Sequence[str]) -> str:
         lines: their names.
     """
     if control not in lines:
-        return f"Nothing is tested against '{control}': no such line{did_you_mean(control, lines)}."
+        why = f"no such line has numbers{did_you_mean(control, lines)}"
+        return f"Nothing is tested against '{control}': {why}."
     return (
         f"Nothing is tested against '{control}': it takes two seeds or problems in which this line "
         "and another have a log gain. The baseline of the gain has none; stale runs do not count."
@@ -256,8 +272,8 @@ def notes(found: Verdicts) -> list[str]:
         )
     if found.left_out:
         said.append(
-            f"Left out: {', '.join(found.left_out)}, where no run has a log gain yet: either its "
-            "own numbers or its baseline's are missing."
+            f"Left out: {', '.join(found.left_out)}, where {found.control.label} has no log gain: "
+            "its own numbers or the baseline's are missing."
         )
     if any(has_fewer(line, found) for line in found.lines):
         said.append(

@@ -127,7 +127,22 @@ def test_a_problem_without_any_gain_is_none(rows):
             row.update(status="missing", metric={})
     found = judge(rows, "method", CONTROL)
     assert (found.problems, found.left_out) == (("scales",), ("digits", "dense"))
-    assert any(note.startswith("Left out: digits, dense, where no run") for note in notes(found))
+    said = f"Left out: digits, dense, where {CONTROL} has no log gain: its own numbers or the"
+    assert any(note.startswith(said) for note in notes(found))
+
+
+def test_a_problem_that_the_control_lacks_is_left_out(rows):
+    rows = json.loads(json.dumps(rows))
+    for row in rows:
+        if (row["cell"]["recipe"]["name"], row["method"]) == ("dense", CONTROL):
+            row.update(status="missing", metric={})
+    found = judge(rows, "method", CONTROL)
+    kept = [row for row in rows if row["cell"]["recipe"]["name"] != "dense"]
+    assert (found.problems, found.left_out) == (("scales", "digits"), ("dense",))
+    assert found.lines == judge(kept, "method", CONTROL).lines
+    assert found.control.rank == 3
+    rest = [row for row in rows if row["cell"]["recipe"]["name"] == "dense"]
+    assert judge(rest, "method", CONTROL) is None
 
 
 def test_a_failed_baseline_is_no_line(rows):

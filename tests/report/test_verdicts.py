@@ -110,7 +110,7 @@ def test_where_nothing_is_tested_the_page_says_why(tmp_path):
     page = report.build(grid_of("fixed"), suite(range(1)), tmp_path).read_text()
     assert "Nothing is tested against &#39;fixed&#39;: it takes two seeds or problems" in page
     page = report.build(grid_of("fixde"), suite(), tmp_path).read_text()
-    assert "no such line (did you mean &#39;fixed&#39;?)" in page
+    assert "no such line has numbers (did you mean &#39;fixed&#39;?)" in page
     assert not (tmp_path / "forest.png").exists()
 
 
