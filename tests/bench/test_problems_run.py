@@ -65,7 +65,7 @@ def test_a_report_of_numbers(tmp_path):
     grid = load_grid("methods", recipe="conflict", smoke=True, settings=[*SMALL, "method=fixed"])
     page = build(grid, found, tmp_path / "report", runs_root=tmp_path / "runs", command="x")
     table = (page.parent / "table.md").read_text()
-    assert "c3 1 - R2" in table
-    assert "c4" not in table
+    assert "c7 1 - R2" in table
+    assert "c8" not in table
     assert "left accuracy" not in page.read_text()
     assert not (page.parent / "samples.png").exists()

@@ -222,7 +222,7 @@ def test_ablate_tries_chooses_and_reports_and_a_second_start_goes_on(tmp_path, r
     stop[0] = 10**6
     result = call("ablate", file, tmp_path)
     assert result.exit_code == 0, result.output
-    assert len(cells) == len({cell.id for cell in cells}) == 4 * 3 + 3 * 4 + 7 * 3 + 7 * 5
+    assert len(cells) == len({cell.id for cell in cells}) == 4 * 3 + 3 * 8 + 7 * 3 + 7 * 9
     out = tmp_path / "reports" / "mine"
     table = (out / "table.md").read_text()
     assert "Chosen settings" in table
