@@ -33,6 +33,7 @@ def test_every_line_has_as_many_trials_judged_on_val_with_seeds_of_their_own(gri
         ["fixed", "scalarised", "cagrad", "single-task"], 3
     )
     assert all(trial.cell.recipe.evaluate.split == "val" for trial in tuning.trials(grid))
+    assert all(trial.cell.recipe.latency.passes == 0 for trial in tuning.trials(grid))
     assert {trial.cell.seed for trial in tuning.trials(grid)} == {100}
     assert {trial.problem for trial in tuning.trials(grid)} == {"conflict"}
     assert len({trial.cell.id for trial in tuning.trials(grid)}) == 12
