@@ -2,9 +2,10 @@
 
 Source: Xin, Ghorbani, Garg, Firat, Gilmer, Do Current Multi-Task Optimization Methods in Deep
 Learning Even Help?, NeurIPS 2022, arXiv:2209.11379, who scan the weights of the sum and find that
-methods land on the front that this gives. Its trials are draws from the simplex of shares. Few
-draws come near the best where losses differ ten-thousandfold: half of the trials therefore share
-out the losses in units of their first values, by weights as constant as the others.
+methods land on the front that this gives. Its trials are draws from the simplex of shares, denser
+in its middle: of ten uniform shares the smallest is a hundredth of the largest. Few draws come near
+the best where losses differ ten-thousandfold: half of the trials therefore share out the losses in
+units of their first values, by weights as constant as the others.
 """
 
 import math
@@ -31,7 +32,7 @@ class Scalarised(LossMethod):
         ValueError: a task without its share, a share without its task, or one below 0.
     """
 
-    space = {"shares": {"dirichlet": 1.0}, "relative": [False, True]}
+    space = {"shares": {"dirichlet": 2.0}, "relative": [False, True]}
     weight_T: Tensor
     task_T: Tensor  # number of each term's task
     start_Q: Tensor  # L(0) of each task, 0 before there is one
