@@ -5,7 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 from mtl_bench.bench.jobs import NOTHING
-from mtl_bench.bench.space import DEFAULT, Tune, check, draws
+from mtl_bench.bench.space import DEFAULT, Tune, check, draws, of_method
+from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell
 from mtl_bench.core.plain import from_dict
 from mtl_bench.core.toml_file import TomlFile
@@ -44,7 +45,7 @@ def check_tuned(
     """Results have other seeds than trials and another split, and a trial can be set.
 
     Raises:
-        ValueError: otherwise, with its line.
+        ValueError: otherwise, with its line; what a method declares, with its file.
     """
     both = sorted({cell.seed for cell in cells}.intersection(tune.seeds))
     if both:
@@ -58,15 +59,18 @@ def check_tuned(
                 "trials",
                 ("tune", 0),
             )
+    for name in sorted({name for cell in cells for name in plugins.part_names(cell.method)}):
+        of_method(name)
     places = (("tune.space", 0), ("tune", 0))
-    try:
-        drawn = draws(tune, cells[0])[1:]
-    except ValueError as error:
-        key = next((key for key in tune.space if key in str(error)), "")
-        raise file.error(str(error), key, *places) from error
-    for values in drawn:
-        own = {key: value for key, value in values.items() if key in tune.space}
-        set_values(cells[0], own, *places)
+    for cell in {cell.recipe.name: cell for cell in reversed(cells)}.values():
+        try:
+            drawn = draws(tune, cell)[1:]
+        except ValueError as error:
+            key = next((key for key in tune.space if key in str(error)), "")
+            raise file.error(str(error), key, *places) from error
+        for values in drawn:
+            own = {key: value for key, value in values.items() if key in tune.space}
+            set_values(cell, own, *places)
 
 
 def suite(file: TomlFile, recipe: str | None) -> dict[str, Mapping[str, Any]]:

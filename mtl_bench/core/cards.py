@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from mtl_bench.core import plugins
@@ -40,6 +41,7 @@ class Card:
     extras: tuple[str, ...] = ()  # what it asks for beyond that
     cost: str = ""  # of a step, in the letters of LEGEND
     settings: Mapping[str, str] = field(default_factory=dict)  # name -> default, as Python text
+    space: Mapping[str, Any] = field(default_factory=dict)  # what trials draw
 
 
 def cards() -> list[Card]:
@@ -53,17 +55,18 @@ def _card(about: Description) -> Card:
     if not line:
         return Card(about)
     source = _source(about.doc)
-    published = VENUE.search(source)
+    published, declared = VENUE.search(source), plugins.declared_in(line)
     return Card(
         about,
         formula=HEADING.split(ast.get_docstring(line[0]) or "")[0].strip(),
         venue=published[1] if published else "",
         year=published[2] if published else "",
         url=_url(source),
-        needs=str(plugins.declared_in(line).get("needs", "")),
+        needs=str(declared.get("needs", "")),
         extras=tuple(_extras(line)),
         cost=_cost(line),
         settings={k: argument.text for k, argument in plugins.arguments_of(line).items()},
+        space=declared["space"],
     )
 
 
@@ -212,10 +215,7 @@ def _section(card: Card) -> str:
     notes = [f"Source: <{card.url}>." if card.url else ""]
     notes += [f"Needs {', '.join((card.needs, *card.extras))}." if card.needs else ""]
     notes += [f"Hyper-parameters: {settings}." if settings else ""]
-    known = plugins.attributes_of(card.about.path) if card.needs else {}
-    drawn = ", ".join(
-        _code(f"{key} = {json.dumps(where)}") for key, where in known.get("space", {}).items()
-    )
+    drawn = ", ".join(_code(f"{key} = {json.dumps(where)}") for key, where in card.space.items())
     notes += [f"Trials draw {drawn}." if drawn else ""]
     return f"### {in_markdown(card.about.name)}\n\n{formula}\n{' '.join(filter(None, notes))}\n"
 

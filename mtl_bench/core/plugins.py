@@ -258,16 +258,30 @@ def declared(kind: str, name: str) -> dict[str, object]:
     return declared_in(lineage(kind, path_of(kind, name)))
 
 
-def declared_in(line: Sequence[ast.ClassDef]) -> dict[str, object]:
-    """Class attributes with a constant value; the nearest class counts."""
-    values: dict[str, object] = {}
-    for node in reversed(line):
-        for item in node.body:
-            if isinstance(item, ast.Assign) and isinstance(item.value, ast.Constant):
-                values |= {ast.unparse(target): item.value.value for target in item.targets}
-            elif isinstance(item, ast.AnnAssign) and isinstance(item.value, ast.Constant):
-                values[ast.unparse(item.target)] = item.value.value
-    return values
+def declared_in(line: Sequence[ast.ClassDef]) -> dict[str, Any]:
+    """Class attributes whose value is written out; the nearest class counts."""
+    values = ((name, _literal(value)) for name, value in _in_bodies(reversed(line)))
+    return {name: value for name, value in values if value is not ...}
+
+
+def read_attribute(kind: str, name: str, attribute: str) -> Any:
+    """A class attribute of a plug-in that its contract has, be it a base's, without importing.
+
+    Raises:
+        ValueError: it is not written out; an unknown plug-in, or none of this kind.
+    """
+    path = path_of(kind, name)
+    line = lineage(kind, path)
+    if not line:
+        raise ValueError(f"{path} defines no subclass of {BASES[kind][1]}")
+    *_, written = (value for other, value in _in_bodies(reversed(line)) if other == attribute)
+    value = _literal(written)
+    if value is ...:
+        raise ValueError(
+            f"{path}: {attribute} = {ast.unparse(written)} cannot be read without running it; "
+            f"write its values out"
+        )
+    return value
 
 
 @functools.cache
@@ -326,12 +340,7 @@ def attributes(kind: str, name: str) -> dict[str, Any]:
     Raises:
         ValueError: an unknown or ambiguous name.
     """
-    return attributes_of(path_of(kind, name))
-
-
-def attributes_of(path: Path) -> dict[str, Any]:
-    """The same of a plug-in's file."""
-    return dict(_attributes(content(path)))
+    return dict(_attributes(content(path_of(kind, name))))
 
 
 @functools.cache
@@ -364,10 +373,29 @@ def _assigned(text: bytes) -> Iterator[tuple[str, ast.expr]]:
     classes = [node for node in _parse(text).body if isinstance(node, ast.ClassDef)]
     contracts = {base for _, base in BASES.values()}
     own = [c for c in classes if {ast.unparse(b) for b in c.bases} & contracts]
-    for item in itertools.chain.from_iterable(node.body for node in own or classes):
+    yield from _in_bodies(own or classes)
+
+
+def _in_bodies(classes: Iterable[ast.ClassDef]) -> Iterator[tuple[str, ast.expr]]:
+    """Names and values that the bodies of classes assign, one after another."""
+    for item in itertools.chain.from_iterable(node.body for node in classes):
         targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
         if isinstance(item, (ast.Assign, ast.AnnAssign)) and item.value is not None:
             yield from ((ast.unparse(target), item.value) for target in targets if target)
+
+
+def _literal(written: ast.expr) -> Any:
+    """Its value; ... where it is none that is written out."""
+    with contextlib.suppress(ValueError):
+        return ast.literal_eval(_frozen(written))
+    return ...
+
+
+def _frozen(written: ast.expr) -> ast.expr:
+    """What stands in a MappingProxyType, or the expression itself."""
+    if isinstance(written, ast.Call) and ast.unparse(written.func) == "MappingProxyType":
+        return written.args[0]
+    return written
 
 
 def bases(kind: str, text: bytes) -> list[str]:
@@ -565,12 +593,8 @@ def _told(line: Sequence[ast.ClassDef]) -> dict[str, str]:
 
 
 def _argument(annotation: ast.expr | None, written: ast.expr | None) -> Argument:
-    default: Any = ...
-    inner = written
-    if isinstance(written, ast.Call) and ast.unparse(written.func) == "MappingProxyType":
-        inner = written.args[0]
-    with contextlib.suppress(ValueError):  # not a literal
-        default = ... if inner is None else ast.literal_eval(inner)
+    inner = None if written is None else _frozen(written)
+    default: Any = ... if inner is None else _literal(inner)
     of = type(default) if type(default) in PLAIN.values() else Any
     kind = of if annotation is None else _type(annotation)
     return Argument(kind, "" if inner is None else ast.unparse(inner), default)
