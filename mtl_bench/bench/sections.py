@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from mtl_bench.bench.jobs import NOTHING
-from mtl_bench.bench.space import DEFAULT, Tune, check, draws, of_method
+from mtl_bench.bench.space import DEFAULT, SPLIT, Tune, check, draws, of_method
 from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell
 from mtl_bench.core.plain import from_dict
@@ -54,8 +54,8 @@ def check_tuned(
     for cell in cells:
         if cell.recipe.evaluate.split != "test":
             raise file.error(
-                f"trials are judged on the split val, and recipe {cell.recipe.name} reports its "
-                f"split {cell.recipe.evaluate.split}: set recipe.evaluate.split to test",
+                f"trials are judged on the split {SPLIT}, and recipe {cell.recipe.name} reports "
+                f"its split {cell.recipe.evaluate.split}: set recipe.evaluate.split to test",
                 "trials",
                 ("tune", 0),
             )

@@ -7,8 +7,8 @@ A space says of each key that --set takes where its values lie:
     "recipe.optim.weight_decay" = [0.0, 1e-5, 1e-4]     one of these
 
 "0.1x" is times the recipe's number. A method's class says the same of its hyper-parameters, in
-`space`, where { "dirichlet": 1.0 } are shares of the tasks that add up to 1; a subclass has that of
-its base. What a line sets itself is not tuned. Trial 0 changes nothing: it is the published setting.
+`space`, where { "dirichlet": 1.0 } are shares of the tasks that add up to 1; a subclass has its
+base's. What a line sets itself is not tuned. Trial 0 changes nothing: it is the published setting.
 """
 
 import math
@@ -25,6 +25,7 @@ from mtl_bench.core.recipe import Count, Whole
 
 TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
 RANGES = ("log", "uniform")
+SPLIT = "val"  # that trials are judged on
 DRAW = 17  # of the scrambling: another one would be other trials
 DEFAULT: Mapping[str, Any] = MappingProxyType(
     {

@@ -401,6 +401,7 @@ def _announce(
 ) -> None:
     from mtl_bench.bench import references, store, tuning
     from mtl_bench.bench.jobs import CELLS, with_parents
+    from mtl_bench.bench.space import SPLIT
 
     counts = {axis: len(values) for axis, values in grid.axes.items()}
     counts |= {"row": len(set(grid.names.values()))} if grid.names else {}
@@ -415,7 +416,7 @@ def _announce(
         typer.echo(
             f"{len(grid.jobs)} results = {product}, less {len(grid.skips)} skipped, and their "
             f"baselines; before them {len(tuning.trials(grid))} trials: {grid.tune.trials} of "
-            f"every line on every problem, judged on the split {tuning.SPLIT}; {about}"
+            f"every line on every problem, judged on the split {SPLIT}; {about}"
         )
         _tell_parts(grid, runs, rerun, data)
     else:

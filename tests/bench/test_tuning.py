@@ -93,6 +93,13 @@ def test_a_metric_that_a_trial_lacks_or_that_is_no_number_makes_it_the_worst(gri
     assert tuning.chosen(grid, tmp_path)["cagrad", "conflict"].trial.number == 1
 
 
+def test_where_no_trial_of_a_problem_has_a_number_the_published_settings_stand(grid, tmp_path):
+    for trial in tuning.trials(grid):
+        finish(trial.cell, tmp_path, math.nan)
+    choices = tuning.chosen(grid, tmp_path).values()
+    assert {(choice.trial.number, choice.score) for choice in choices} == {(0, -math.inf)}
+
+
 def test_results_have_the_chosen_settings_the_grids_seeds_and_the_recipes_split(grid, tmp_path):
     for trial, error in zip(of(grid, "cagrad"), (1.0, 2.0, 0.5), strict=True):
         finish(trial.cell, tmp_path, error)
