@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from mtl_bench.bench.jobs import NOTHING
-from mtl_bench.bench.space import DEFAULT, SPLIT, Tune, check, draws, of_method
+from mtl_bench.bench.space import DEFAULT, SPLIT, TUNED, Tune, check, draws, of_method
 from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell
 from mtl_bench.core.plain import from_dict
@@ -24,11 +24,17 @@ def tune(file: TomlFile, smoke: bool) -> Tune | None:
     if values is None:
         return None
     places = (("tune.space", 0), ("tune", 0))
-    for key, where in values.get("space", {}).items():
+    space = values.get("space", {})
+    if not isinstance(space, dict):
+        raise file.error(f"write it as [tune.space], a section, not {space!r}", "space", *places)
+    for key, where in space.items():
         try:
             check(key, where)
         except ValueError as error:
             raise file.error(str(error), key, *places) from error
+        if not key.startswith(TUNED):
+            message = f"trials cannot set '{key}', only what begins with {', '.join(TUNED)}"
+            raise file.error(message, key, *places)
     try:
         found = from_dict(Tune, {"space": DEFAULT, **values}, "tune.")
     except ValueError as error:
@@ -77,17 +83,30 @@ def suite(file: TomlFile, recipe: str | None) -> dict[str, Mapping[str, Any]]:
     """Recipe -> what the suite sets of its cells; of the one that was asked for, where one was.
 
     Raises:
-        ValueError: an entry that is no recipe's name and no table with one.
+        ValueError: an entry that is no recipe's name and no table with one, one that stands twice,
+            no entry, or a recipe beside the suite.
     """
+    if "suite" not in file.values:
+        return {}
     found: dict[str, Mapping[str, Any]] = {}
-    for entry in file.values.get("suite", []):
+    for entry in file.values["suite"]:
         values = dict(entry) if isinstance(entry, dict) else {"recipe": entry}
         name = values.pop("recipe", None)
         if not isinstance(name, str):
             message = 'a suite lists recipes: "NAME" or { recipe = "NAME", KEY = VALUE }'
             raise file.error(message, "suite", ("", 0))
+        if name in found:
+            raise file.error(f"recipe '{name}' stands twice in the suite", "suite", ("", 0))
         found[name] = values
-    return {recipe: found.get(recipe, NOTHING)} if found and recipe else found
+    if not found:
+        raise file.error('a suite needs a recipe: suite = ["NAME", ...]', "suite", ("", 0))
+    tables = [(("", 0), file.values), (("axes", 0), file.values.get("axes", {}))]
+    tables += [(("row", index), row) for index, row in enumerate(file.values.get("row", []))]
+    for place, table in tables:
+        for key in ("recipe", "smoke_recipe"):
+            if key in table:
+                raise file.error(f"leave out '{key}': the suite names the recipes", key, place)
+    return {recipe: found.get(recipe, NOTHING)} if recipe else found
 
 
 def check_rows(file: TomlFile, axes: Mapping[str, Any], suite: Mapping[str, Any]) -> None:

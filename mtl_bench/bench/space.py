@@ -1,6 +1,6 @@
 """What trials may set, and the quasi-random values that they take.
 
-A space says of each key that --set takes where its values lie:
+A space says of keys that --set takes, those that begin as in TUNED, where their values lie:
 
     "recipe.optim.lr" = { log = ["0.1x", "10x"] }       between two numbers, evenly in the logarithm
     "method.alpha" = { uniform = [0.1, 0.9] }           between two numbers; whole where both are
@@ -25,6 +25,10 @@ from mtl_bench.core.recipe import Count, Whole
 
 TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
 RANGES = ("log", "uniform")
+TUNED = (  # what begins a key that trials may set: none is what lines and problems are told by
+    *("recipe.augment.", "recipe.network.", "recipe.loss.", "recipe.optim.", "recipe.pseudo."),
+    *("method.", "backbone."),
+)
 SPLIT = "val"  # that trials are judged on
 DRAW = 17  # of the scrambling: another one would be other trials
 DEFAULT: Mapping[str, Any] = MappingProxyType(

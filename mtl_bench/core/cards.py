@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 from mtl_bench.core import plugins
+from mtl_bench.core.declared import arguments_of, declared_in
 from mtl_bench.core.fingerprint import forget_edited
 from mtl_bench.core.plugins import Description
 from mtl_bench.core.text import in_markdown
@@ -55,7 +56,7 @@ def _card(about: Description) -> Card:
     if not line:
         return Card(about)
     source = _source(about.doc)
-    published, declared = VENUE.search(source), plugins.declared_in(line)
+    published, declared = VENUE.search(source), declared_in(line)
     return Card(
         about,
         formula=HEADING.split(ast.get_docstring(line[0]) or "")[0].strip(),
@@ -65,7 +66,7 @@ def _card(about: Description) -> Card:
         needs=str(declared.get("needs", "")),
         extras=tuple(_extras(line)),
         cost=_cost(line),
-        settings={k: argument.text for k, argument in plugins.arguments_of(line).items()},
+        settings={k: argument.text for k, argument in arguments_of(line).items()},
         space=declared["space"],
     )
 
@@ -91,7 +92,7 @@ def _is_a(line: Sequence[ast.ClassDef], base: str) -> bool:
 
 
 def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
-    values = plugins.declared_in(line)
+    values = declared_in(line)
     if values["reevaluates"]:
         yield "the losses after the step"
     if _is_a(line, "LookAheadMethod"):
@@ -106,7 +107,7 @@ def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
 
 def _cost(line: Sequence[ast.ClassDef]) -> str:
     """As `backward` spends it; what the method itself computes is not in it."""
-    values = plugins.declared_in(line)
+    values = declared_in(line)
     if values.get("needs") == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
     if _is_a(line, "PerturbedMethod"):

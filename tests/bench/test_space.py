@@ -76,6 +76,10 @@ def test_bounds_may_be_times_the_recipes_number_and_whole():
         ('"recipe.optim.rate" = [1e-3]', "unknown key"),
         ('"recipe.optim.lr" = ["high"]', "must be float"),
         ('"recipe.optim.clip" = { log = ["0.1x", "2x"] }', "no number"),
+        ('"recipe.evaluate.split" = ["test"]', "cannot set 'recipe.evaluate.split', only what"),
+        ('"recipe.data.val_scenes" = [3, 4]', "cannot set 'recipe.data.val_scenes', only what"),
+        ("seed = [0, 1]", "cannot set 'seed', only what begins with recipe.augment., "),
+        ('method = ["rlw"]', "cannot set 'method', only what begins with "),
     ],
 )
 def test_a_wrong_space_is_told_with_its_line(tmp_path, where, said):
@@ -89,6 +93,7 @@ def test_a_wrong_space_is_told_with_its_line(tmp_path, where, said):
     ("old", "new", "said"),
     [
         ("trials = 3", "trials = 0", "trials' must be >= 1"),
+        ("trials = 3", "space = 3", "write it as .tune.space., a section, not 3"),
         ("trials = 3", "trial = 3", "unknown key 'tune.trial' .did you mean 'trials'"),
         ("seeds = [100]", "seeds = []", "seeds' must be non-empty"),
         ("seeds = [100]", "seeds = [100, 1]", "seed 1 is a result's, too"),

@@ -156,6 +156,11 @@ def test_a_smoke_run_of_a_suite_is_short(tmp_path):
         ("[3]", "a suite lists recipes"),
         ('[{ backbone = "mlp" }]', "a suite lists recipes"),
         ('[{ recipe = "scales", "recipe.optim.rate" = 1 }]', "unknown key"),
+        ("[]", 'line 2: a suite needs a recipe: suite = ["NAME", ...]'),
+        ('["scales", { recipe = "scales", seed = 4 }]', "'scales' stands twice in the suite"),
+        ('["scales"]\nrecipe = "conflict"', "line 3: leave out 'recipe': the suite names"),
+        ('["scales"]\nsmoke_recipe = "smoke"', "line 3: leave out 'smoke_recipe': the suite"),
+        ('["scales"]\n[[row]]\nname = "a"\nrecipe = "digits"', "line 5: leave out 'recipe'"),
     ],
 )
 def test_a_wrong_suite_is_told_with_its_line(tmp_path, suite, said):
@@ -244,6 +249,13 @@ def test_ablate_tries_chooses_and_reports_and_a_second_start_goes_on(tmp_path, r
     cells.clear()
     assert call("ablate", file, tmp_path).exit_code == 0
     assert cells == []
+
+
+def test_a_setting_that_a_line_cannot_have_is_told_before_a_trial_runs(tmp_path, ran):
+    space = GRID + '[tune.space]\n"method.c" = [0.1]\n'
+    result = call("ablate", grid_file(tmp_path, space), tmp_path)
+    assert "method 'fixed' has no 'c'" in result.output
+    assert ran[0] == []
 
 
 def test_a_result_is_against_the_tuned_baseline_of_its_seed_and_a_failure_stands(tmp_path, ran):
