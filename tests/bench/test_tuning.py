@@ -141,11 +141,13 @@ def test_recipe_takes_one_problem_of_a_suite_as_the_suite_has_it(tmp_path):
     assert [c.id for c in part.cells] == [c.id for c in whole.cells[:6]]
 
 
-def test_a_smoke_run_of_a_suite_is_short(tmp_path):
-    grid = load_grid(grid_file(tmp_path, SUITE), smoke=True)
+@pytest.mark.parametrize(("text", "cells"), [(SUITE, 6), (GRID, 3)], ids=["suite", "recipe"])
+def test_a_smoke_run_is_short(tmp_path, text, cells):
+    grid = load_grid(grid_file(tmp_path, text), smoke=True)
     assert grid.name == "mine-smoke"
+    assert {c.recipe.name for c in grid.cells} <= {"scales", "conflict"}
     assert all(c.recipe.smoke and c.recipe.optim.steps == 6 for c in grid.cells)
-    assert (len(grid.cells), grid.tune.trials) == (6, 2)
+    assert (len(grid.cells), grid.tune.trials) == (cells, 2)
 
 
 @pytest.mark.parametrize(
