@@ -132,7 +132,9 @@ def read_pack(path: Path) -> Iterator[Found | Left]:
         yield _readable(f"line {number} of {path}", partial(_of_line, values))
 
 
-def _of_line(values: Mapping[str, Any]) -> Found | Left:
+def _of_line(values: Any) -> Found | Left:
+    if not isinstance(values, dict):
+        raise ValueError("no job with its row")
     kind = next((kind for kind in KINDS if isinstance(values.get(kind), dict)), None)
     if kind is None or not isinstance(row := values.get("row"), dict):
         raise ValueError("no job with its row")
@@ -142,19 +144,21 @@ def _of_line(values: Mapping[str, Any]) -> Found | Left:
         return _judged(Found(job, {}, failed))
     if wrong := store.fault(row, job):
         raise ValueError(f"the row is {wrong}")
+    if not isinstance(values.get(CURVE, ""), str):
+        raise ValueError(f"its {CURVE} is no text")
     return _judged(Found(job, row, beside={k: values[k] for k in (CURVE,) if k in values}))
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """What the jobs' lines say."""
+def _lines(path: Path) -> Iterator[Any]:
+    """What the lines behind the first say, each a value of JSON."""
     try:
         with lzma.open(path, "rt", encoding="utf-8") as file:
             head = json.loads(next(file, "null"))
             if not isinstance(head, dict) or head.get("format") != FORMAT["format"]:
                 raise ValueError("it begins with other words")
             if head.get("version") != FORMAT["version"]:
-                version = head.get("version")
-                raise ValueError(f"it is of version {version}, and this one reads 1")
+                own, its = FORMAT["version"], head.get("version")
+                raise ValueError(f"it is of version {its}, and this one reads {own}")
             yield from map(json.loads, file)
     except (lzma.LZMAError, EOFError, ValueError) as error:
         raise ValueError(

@@ -70,6 +70,10 @@ def collect(
     from mtl_bench.bench import collect as collecting
     from mtl_bench.cli.grid import Choice
 
+    of_a_grid = {"--recipe": recipe, "--seeds": seeds, "--smoke": smoke, "--set": settings}
+    for option, value in {**of_a_grid, "--pretrained": pretrained}.items():
+        if value and not grid:
+            raise ValueError(f"{option} goes with --pack FILE.xz --grid NAME: it says which jobs")
     if pack is None:
         if not sources:
             raise ValueError("nothing to collect: name runs folders or packs, or --pack FILE.xz")

@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 from markupsafe import Markup
 
+from mtl_bench.bench import tuning
 from mtl_bench.bench.tuning import Tried
 from mtl_bench.core import quality
 from mtl_bench.core.columns import FPS, Column
@@ -447,7 +448,7 @@ def _write(
     more = {f"{TRIALS}.csv": trials.records(tried)} if tried else {}
     if judged is not None:
         first, said = sections(judged, tune), tuple(notes(judged))
-        behind = trials.distances(judged, trials.ended(tried))
+        behind = trials.distances(judged, tuning.ended(tried))
         first += [] if behind is None else [behind]
         table = replace(table, sections=(*first, *table.sections), notes=(*said, *table.notes))
         rest = brief.sections if len(problems) == 1 else ()  # those of many problems: on the page
@@ -483,7 +484,7 @@ def _write(
 
 def _figures_of_verdicts(judged: Verdicts, tried: Sequence[Tried], folder: Path) -> list[Figure]:
     """Those of all problems together, and of trials each problem's trade-off."""
-    settings = trials.ended(tried)
+    settings = tuning.ended(tried)
     drawn = {
         "forest": verdict_plots.forest(judged, folder, "forest"),
         "bands": verdict_plots.bands(judged, folder, "bands"),

@@ -191,6 +191,8 @@ def test_sources_that_are_none_are_one_line_before_anything_is_taken(other, tmp_
     assert "is --runs itself" in run(other, "--runs", other, code=2)
     assert "nothing to collect" in run(code=2)
     assert "--curves goes with --pack" in run(other, "--curves", code=2)
+    assert "--smoke goes with --pack FILE.xz --grid NAME" in run(other, "--smoke", code=2)
+    assert "--seeds goes with --pack" in run("--pack", foreign, "--seeds", 3, code=2)
     assert "--weights does not go with --pack" in run("--weights", "--pack", foreign, code=2)
 
 
@@ -288,8 +290,9 @@ def test_a_line_that_this_version_cannot_read_hurts_no_other(other, tmp_path):
     run("--pack", pack, "--runs", other)
     lines = lzma.decompress(pack.read_bytes()).decode().splitlines()
     values = json.loads(lines[1])
-    for change in ({"cell": {**values["cell"], "later": 1}}, {"row": 3}, {"cell": None}):
-        more = json.dumps({**values, **change})
+    changes = ({"cell": {**values["cell"], "later": 1}}, {"row": 3}, {"cell": None})
+    others = [{**values, **change} for change in (*changes, {"curve.csv": 3})]
+    for more in map(json.dumps, [*others, 3, [values], None]):
         pack.write_bytes(lzma.compress("\n".join([*lines, more]).encode()))
         text = run(pack, "--runs", runs)
         assert "left out, unreadable: 1 (" in text
