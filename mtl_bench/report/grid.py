@@ -67,6 +67,7 @@ from mtl_bench.train.curve import read as read_curve
 PUBLISHED = Path(__file__).parent / "literature.toml"
 AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
 VERDICTS, TRIALS = "verdicts", "trials"  # stems of their files
+ALIKE = 5  # cells that lack numbers for one reason and still have a line each
 WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples", "extremes")
 TRAINED_BRIEFLY = "Cells marked smoke were trained for a few steps to show that the pipeline works."
 
@@ -277,7 +278,10 @@ def fill(results: Results, short: bool = False) -> Table:
     banner = f"{SMOKE.capitalize()}." if results.smoke else ""
     said = {"Quality": f" {' '.join(notes)}"}
     of = f"{results.problem}: " * bool(results.problem)
-    lacking = [TableRow.of(of + c.label, c.status, c.reason, c.slug) for c in results.unfinished]
+    alike: dict[tuple[str, str], list[Unfinished]] = {}
+    for cell in results.unfinished:
+        alike.setdefault((cell.status, cell.reason), []).append(cell)
+    lacking = [line for cells in alike.values() for line in _without_numbers(of, cells)]
     why = Head("why", left=True, css=WRAP), Head("folder", left=True, page_only=True)
     heads = (*Head.words("cell", "status"), *why)
     return Table(
@@ -296,6 +300,15 @@ def fill(results: Results, short: bool = False) -> Table:
         published=tuple(_published(source, results.axes[0]) for source in results.published),
         banner=banner,
     )
+
+
+def _without_numbers(of: str, alike: Sequence[Unfinished]) -> list[TableRow]:
+    """A line each of cells with the same status and reason, one line of very many."""
+    first, last = alike[0], alike[-1]
+    if len(alike) <= ALIKE:
+        return [TableRow.of(of + c.label, c.status, c.reason, c.slug) for c in alike]
+    named = f"{of}{len(alike)} cells, {first.label} to {last.label}"
+    return [TableRow.of(named, first.status, first.reason, "")]
 
 
 def together(tables: Sequence[Table]) -> Table:
@@ -451,8 +464,10 @@ def _write(
         behind = trials.distances(judged, tuning.ended(tried))
         first += [] if behind is None else [behind]
         table = replace(table, sections=(*first, *table.sections), notes=(*said, *table.notes))
-        rest = brief.sections if len(problems) == 1 else ()  # those of many problems: on the page
-        brief = replace(brief, sections=(*first, *rest), notes=(*said, *brief.notes))
+        if len(problems) == 1:
+            brief = replace(brief, sections=(*first, *brief.sections), notes=(*said, *brief.notes))
+        else:  # the verdicts; each problem's numbers are on the page
+            brief = replace(brief, sections=tuple(first[:1]), notes=said)
         more[f"{VERDICTS}.csv"] = records(judged)
     elif control is not None:
         lines = [", ".join(group.identity) for group in groups]

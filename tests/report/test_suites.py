@@ -319,6 +319,17 @@ def test_cells_of_a_suite_without_numbers_name_their_problem(rows):
     assert section.lines[0].cells[0].text == "scales: baseline, seed 0"
 
 
+def test_many_cells_that_lack_numbers_for_one_reason_share_a_line(rows):
+    rows = json.loads(json.dumps(rows))
+    for row in rows[:8]:
+        row["status"], row["error"] = "missing", "its trials have not ended"
+    fail(rows[8])
+    table = fill(tabulate(rows[:9], Layout(rows="method", control=CONTROL), problem="scales"))
+    (section,) = table.lacking
+    assert [line.cells[1].text for line in section.lines] == ["missing", "failed"]
+    assert section.lines[0].cells[0].text.startswith("scales: 8 cells, ")
+
+
 def test_profiles_say_how_many_runs_are_out_of_view(tmp_path):
     rows = suite_rows({**{f"method_{i}": 0.0 for i in range(4)}, "far": -40.0})
     said = profiles(judge(rows, "method", CONTROL), tmp_path, "profiles")

@@ -40,6 +40,13 @@ def verdict_of(rows, name):
     return next(line.comparison for line in found.lines if line.label == name)
 
 
+def test_a_busy_machine_makes_no_line_dearer():
+    rows = suite(range(8))
+    for row in rows[::3]:  # a third of every line's runs, another one each time
+        row["time"]["step_ms"] *= 4
+    assert judge(rows, "method", "fixed").lines[0].step_x == 2.5
+
+
 def test_lines_are_told_apart_although_seeds_spread_wider():
     found = judge(suite(range(8)), "method", "fixed")
     verdicts = {line.label: line.comparison.verdict for line in found.lines}
