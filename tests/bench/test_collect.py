@@ -174,6 +174,26 @@ def test_a_stale_row_without_weights_is_not_trained_again_unasked(other, tmp_pat
     assert not store.can_renew(cell, runs)  # what there was would be of no use
 
 
+def test_what_other_code_made_comes_where_it_is_asked_for_and_replaces_nothing(other, tmp_path):
+    runs, pack, old = tmp_path / "runs", tmp_path / "rows.xz", deepcopy(provenance.code(cell_of()))
+    old["train"]["harness"] = "another"
+    for seed in (1, 2, 3):
+        write(other, cell_of("fixed", seed), code=old)
+    said = run("--pack", pack, "--runs", other, "--stale").splitlines()
+    assert said[0].startswith(f"packed 7 of {other}")
+    assert run("--pack", tmp_path / "less.xz", "--runs", other).startswith("packed 4 ")
+
+    write(runs, cell_of("fixed", 1), pq=1.0)  # done
+    write(runs, cell_of("fixed", 2), pq=2.0, code=old)  # as stale as the other
+    kept = contents(runs)
+    assert "left out, stale: 3 (train: harness changed)" in run(pack, "--runs", tmp_path / "none")
+    said = run(pack, "--runs", runs, "--stale").splitlines()
+    assert said[0] == f"collected 5 into {runs}"
+    assert said[1].startswith("left out, already here: 2: ")
+    assert kept.items() <= contents(runs).items()
+    assert store.status(cell_of("fixed", 3), runs) == "stale"
+
+
 def test_sources_that_are_none_are_one_line_before_anything_is_taken(other, tmp_path):
     runs, empty, foreign = tmp_path / "runs", tmp_path / "empty", tmp_path / "foreign.xz"
     empty.mkdir()
