@@ -5,13 +5,14 @@ is little: small plain values, gathered in the order of the ranks, and sums of t
 alone is `Ranks` itself, whose every operation is the identity; there is no process group then.
 
 Ranks are told who they are by their environment, as torchrun and srun set it, or rank 0 starts the
-others itself. All meet at a store that rank 0 serves. There each beats, and watches the others: a
-rank that dies or hangs ends them all, also where a collective of the GPU would wait for ever.
+others itself. All meet at a store that rank 0 serves. There each beats, and watches the others: one
+that dies or hangs ends them all, also where a collective of GPUs would wait for ever.
 """
 
 import contextlib
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -27,6 +28,8 @@ from mtl_bench.core.provenance import cores
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+    from mtl_bench.core.recipe import Optim
 
 JOIN_S = 300  # for the last rank to come
 BEAT_S = 2.0
@@ -163,37 +166,40 @@ class Processes(Ranks):
         padded = (len(text).to_bytes(8) + text)[:room].ljust(room, b"\0")
         mine = torch.frombuffer(bytearray(padded), dtype=torch.uint8)
         found = [torch.empty_like(mine) for _ in range(self.size)]
-        with self._lost():
+        with self._or_lost():
             torch.distributed.all_gather(found, mine)
         return [one.numpy().tobytes() for one in found]
 
     def sum_(self, tensor: "Tensor") -> "Tensor":
         import torch
 
-        with self._lost():
+        with self._or_lost():
             torch.distributed.all_reduce(tensor)
         return tensor
 
     @contextlib.contextmanager
-    def _lost(self) -> Iterator[None]:
+    def _or_lost(self) -> Iterator[None]:
         """Say which rank has ended, and why, where that breaks what is done inside."""
         try:
             yield
         except RuntimeError as error:
-            raise LostError(self._who()) from error
+            end = time.monotonic() + BEAT_S
+            try:
+                while time.monotonic() < end:
+                    self._still_all()
+                    time.sleep(POLL_S)
+            except RuntimeError:
+                raise LostError("rank 0 has gone") from error
+            raise LostError("another rank has gone without a word") from error
 
-    def _who(self) -> str:
-        end = time.monotonic() + BEAT_S
-        try:
-            while time.monotonic() < end:
-                for rank in range(self.size):
-                    if rank != self.rank and self._store.check([f"left/{rank}"]):
-                        why = self._store.get(f"left/{rank}").decode()
-                        return f"rank {rank} has ended: {why or 'it was done'}"
-                time.sleep(POLL_S)
-        except RuntimeError:
-            return "rank 0 has gone"
-        return "another rank has gone without a word"
+    def _still_all(self) -> None:
+        """Raises: LostError, KeyboardInterrupt: a rank has ended."""
+        for rank in range(self.size):
+            if rank != self.rank and self._store.check([f"left/{rank}"]):
+                why = self._store.get(f"left/{rank}").decode()
+                if why == INTERRUPTED:
+                    raise KeyboardInterrupt(f"rank {rank} was told to stop")
+                raise LostError(f"rank {rank} has ended: {why or 'it was done'}")
 
     # --- what rank 0 tells ------------------------------------------------------------------------
 
@@ -235,7 +241,11 @@ class Processes(Ranks):
         self._joined, cuda = True, device.type == "cuda"
         if cuda:
             torch.cuda.set_device(device)
-        with self._lost():
+        self._store.set(f"here/{self.rank}", "")
+        with self._or_lost():
+            while not self._store.check([f"here/{rank}" for rank in range(self.size)]):
+                self._still_all()
+                time.sleep(POLL_S)
             torch.distributed.init_process_group(
                 "cpu:gloo,cuda:nccl" if cuda else "gloo",
                 store=PrefixStore("group", self._store),
@@ -271,7 +281,8 @@ class Processes(Ranks):
     # --- who lives --------------------------------------------------------------------------------
 
     def _watch(self, store: Any) -> None:
-        """Beat, and end this process when another rank does not any more."""
+        """Beat, and end this process when another rank does not any more. Rank 0 is asked to stop
+        as by a signal where another one has ended before it."""
         others = [rank for rank in range(self.size) if rank != self.rank]
         beats, looks = dict.fromkeys(others, 0), dict.fromkeys(others, 0)
         lost = ""
@@ -280,8 +291,11 @@ class Processes(Ranks):
                 store.add(f"beat/{self.rank}", 1)
                 if self.address is None and not self._others:
                     continue  # nobody has been started yet
-                for rank in others:
+                for rank in list(others):
                     if store.check([f"left/{rank}"]):
+                        others.remove(rank)
+                        if self.first:  # before it has said that all is done
+                            os.kill(os.getpid(), signal.SIGTERM)
                         continue
                     now = store.add(f"beat/{rank}", 0)
                     looks[rank] = 0 if now != beats[rank] else looks[rank] + 1
@@ -295,11 +309,11 @@ class Processes(Ranks):
             os._exit(1)
 
 
-def ranks(count: int | None = None) -> contextlib.AbstractContextManager[Ranks]:
-    """This process among its ranks, to be entered.
+def joined(count: int | None = None) -> contextlib.AbstractContextManager[Ranks]:
+    """This process among its ranks, which `with` joins and leaves.
 
     Args:
-        count: that this process is to start where its environment does not make it one of several.
+        count: of them, to be started where the environment does not make this one of several.
 
     Raises:
         ValueError: an environment that says only half of it.
@@ -332,6 +346,17 @@ def _by_environment() -> Processes | None:
     port = 20000 + (int(env["SLURM_JOB_ID"]) * 16 + int(env["SLURM_STEP_ID"])) % 20000
     rank, local = int(env["SLURM_PROCID"]), int(env["SLURM_LOCALID"])
     return Processes(rank, size, local, (nodes[0], port))
+
+
+def check_share(optim: "Optim", size: int) -> None:
+    """Raises: ValueError: so many ranks cannot have equally many parts of a batch."""
+    parts = optim.batch // (optim.micro_batch or optim.batch)
+    if parts % size:
+        raise ValueError(
+            f"{size} ranks cannot share the {parts} part{'s' * (parts > 1)} of a batch: "
+            f"recipe.optim.micro_batch = {optim.micro_batch} of recipe.optim.batch = "
+            f"{optim.batch}; set micro_batch, or take a number of ranks that divides {parts}"
+        )
 
 
 def _line(error: BaseException) -> str:

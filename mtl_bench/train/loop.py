@@ -14,7 +14,7 @@ from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
 from mtl_bench.core.device import Compute, drawing, initial_weights, seed_for
 from mtl_bench.core.method import LossMethod, Method, Step
-from mtl_bench.core.ranks import ALONE, Ranks
+from mtl_bench.core.ranks import ALONE, Ranks, check_share
 from mtl_bench.core.task import Task, tasks_of_cell, terms_of
 from mtl_bench.core.terms import Term
 from mtl_bench.data.loader import train_batches
@@ -69,7 +69,7 @@ def train(
         Interrupted: a signal asked to stop; the state is saved.
     """
     optim = cell.recipe.optim
-    check_ranks(optim, ranks.size)
+    check_share(optim, ranks.size)
     model, method, optimizer = build(cell, compute)
     path, step = run_dir / CHECKPOINT, 0
     if isinstance(method, Replay):
@@ -228,17 +228,6 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, optim: Optim, step: int)
     for group in optimizer.param_groups:
         group["lr"] = group["initial_lr"] * factor
     return factor
-
-
-def check_ranks(optim: Optim, size: int) -> None:
-    """Raises: ValueError: so many ranks cannot have equally many parts of a batch."""
-    parts = optim.batch // (optim.micro_batch or optim.batch)
-    if parts % size:
-        raise ValueError(
-            f"{size} ranks cannot share the {parts} part{'s' * (parts > 1)} of a batch: set "
-            f"recipe.optim.micro_batch (batch {optim.batch}, micro_batch {optim.micro_batch}), or "
-            f"take a number of ranks that divides {parts}"
-        )
 
 
 def check_equal(model: nn.Module, ranks: Ranks, step: int) -> None:
