@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 JOIN_S = 300  # for the last rank to come
 BEAT_S = 2.0
 SILENT = 10  # looks at a rank that did not beat between any two of them: it is gone
-LEAVE_S = 10.0  # for the others to end, before rank 0 takes the store away
+LEAVE_S = 5.0  # for the others to end, before rank 0 takes the store away
 POLL_S = 0.1
 FRAME = 4096  # bytes of a gathered value for which one collective is enough
 OWN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
@@ -137,6 +137,8 @@ class Processes(Ranks):
                 end = time.monotonic() + LEAVE_S
                 left = [f"left/{rank}" for rank in range(1, self.size)]
                 while time.monotonic() < end and not self._store.check(left):
+                    if any(other.poll() for other in self._others):
+                        break  # one that was killed says no more
                     time.sleep(POLL_S)
         for other in self._others:
             try:
@@ -260,6 +262,7 @@ class Processes(Ranks):
         values = (rank, self.size, rank, host, port)
         environment = {**os.environ, **dict(zip(OWN, map(str, values), strict=True))}
         environment.setdefault("OMP_NUM_THREADS", str(max(1, cores() // self.size)))
+        environment.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # rank 0 tells what has happened
         if sys.platform == "linux":
             os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
             environment.setdefault("GLOO_SOCKET_IFNAME", "lo")
