@@ -39,6 +39,7 @@ POLL_S = 0.1
 FRAME = 4096  # bytes of a gathered value for which one collective is enough
 OWN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 INTERRUPTED = "interrupted"
+HERE = "127.0.0.1"
 
 
 class LostError(Exception):
@@ -101,12 +102,14 @@ class Processes(Ranks):
         from torch.distributed import TCPStore  # type: ignore[attr-defined]
 
         wait = timedelta(seconds=JOIN_S)
-        host, port = self.address or ("127.0.0.1", 0)
+        host, port = self.address or (HERE, 0)
         # torchrun serves a store itself, at the address that it tells
         serves = self.first and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
         listen = None
-        if self.address is None:  # no other machine has anything to seek here
-            listener = socket.create_server((host, 0))
+        if host == HERE and sys.platform == "linux":
+            os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
+        if host == HERE and serves:  # no other machine has anything to seek here
+            listener = socket.create_server((host, port))
             port, listen = listener.getsockname()[1], listener.detach()
         try:
             self._store = TCPStore(host, port, None, serves, wait, False, master_listen_fd=listen)
@@ -263,9 +266,6 @@ class Processes(Ranks):
         environment = {**os.environ, **dict(zip(OWN, map(str, values), strict=True))}
         environment.setdefault("OMP_NUM_THREADS", str(max(1, cores() // self.size)))
         environment.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # rank 0 tells what has happened
-        if sys.platform == "linux":
-            os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
-            environment.setdefault("GLOO_SOCKET_IFNAME", "lo")
         command = [sys.executable, "-m", "mtl_bench", *sys.argv[1:]]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment)
 
@@ -309,6 +309,8 @@ class Processes(Ranks):
                 lost = "rank 0 has gone"
         if lost and not self._over.wait(2 * BEAT_S):  # who waits for that rank may say more
             print(f"mtl-bench: rank {self.rank} ends: {lost}", file=sys.stderr, flush=True)
+            for other in self._others:
+                other.kill()
             os._exit(1)
 
 
@@ -348,7 +350,7 @@ def _by_environment() -> Processes | None:
     nodes = subprocess.run(told, check=True, capture_output=True, text=True).stdout.split()
     port = 20000 + (int(env["SLURM_JOB_ID"]) * 16 + int(env["SLURM_STEP_ID"])) % 20000
     rank, local = int(env["SLURM_PROCID"]), int(env["SLURM_LOCALID"])
-    return Processes(rank, size, local, (nodes[0], port))
+    return Processes(rank, size, local, (nodes[0] if len(nodes) > 1 else HERE, port))
 
 
 def check_share(optim: "Optim", size: int) -> None:
