@@ -210,10 +210,19 @@ class Processes(Ranks):
 
     def tell(self, task: dict[str, Any], device: "torch.device") -> None:
         if self.address is None and not self._others:
+            self._enough(device)
             self._others = [self._started(rank) for rank in range(1, self.size)]
         self._store.set(f"task/{self._tasks}", json.dumps(task))
         self._tasks += 1
         self._join(device)
+
+    def _enough(self, device: "torch.device") -> None:
+        """Raises: ValueError: fewer GPUs than ranks that are to be started."""
+        import torch
+
+        if device.type == "cuda" and torch.cuda.device_count() < self.size:
+            count = torch.cuda.device_count()
+            raise ValueError(f"{self.size} ranks, but this process sees {count} GPUs: one each")
 
     def told(self) -> dict[str, Any] | None:
         """What rank 0 says next; None: no more, it has ended.
