@@ -13,8 +13,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
-import subprocess
 import sys
 import threading
 import time
@@ -23,9 +21,9 @@ from datetime import timedelta
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from mtl_bench.core.provenance import cores
-
 if TYPE_CHECKING:
+    import subprocess
+
     import torch
     from torch import Tensor
 
@@ -99,6 +97,8 @@ class Processes(Ranks):
         self._over = threading.Event()
 
     def __enter__(self) -> Self:
+        import socket
+
         from torch.distributed import TCPStore  # type: ignore[attr-defined]
 
         wait = timedelta(seconds=JOIN_S)
@@ -143,16 +143,19 @@ class Processes(Ranks):
                     if any(other.poll() for other in self._others):
                         break  # one that was killed says no more
                     time.sleep(POLL_S)
-        for other in self._others:
-            try:
-                other.wait(LEAVE_S)
-            except subprocess.TimeoutExpired:
-                other.kill()
-                other.wait()
+        self._end_others()
         if self._joined and error is None:
             import torch
 
             torch.distributed.destroy_process_group()
+
+    def _end_others(self) -> None:
+        end = time.monotonic() + LEAVE_S
+        while any(other.poll() is None for other in self._others) and time.monotonic() < end:
+            time.sleep(POLL_S)
+        for other in self._others:
+            other.kill()
+            other.wait()
 
     # --- what ranks share -------------------------------------------------------------------------
 
@@ -270,6 +273,10 @@ class Processes(Ranks):
 
     def _started(self, rank: int) -> "subprocess.Popen[bytes]":
         """The same command, as another rank."""
+        import subprocess
+
+        from mtl_bench.core.provenance import cores
+
         host, port = self._place
         values = (rank, self.size, rank, host, port)
         environment = {**os.environ, **dict(zip(OWN, map(str, values), strict=True))}
@@ -281,6 +288,8 @@ class Processes(Ranks):
     @contextlib.contextmanager
     def sharing_cores(self) -> Iterator[None]:
         import torch
+
+        from mtl_bench.core.provenance import cores
 
         before = torch.get_num_threads()
         if self.address is None and "OMP_NUM_THREADS" not in os.environ:
@@ -355,6 +364,8 @@ def _by_environment() -> Processes | None:
     size = int(env.get("SLURM_STEP_NUM_TASKS", "1"))
     if size == 1:
         return None
+    import subprocess
+
     told = ["scontrol", "show", "hostnames", env["SLURM_STEP_NODELIST"]]
     nodes = subprocess.run(told, check=True, capture_output=True, text=True).stdout.split()
     port = 20000 + (int(env["SLURM_JOB_ID"]) * 16 + int(env["SLURM_STEP_ID"])) % 20000
