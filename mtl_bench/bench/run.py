@@ -99,7 +99,8 @@ def run_cell(
 
     progress.update("latency", 0, 1)
     timing, latency_s = time_cell(model, cell, root, compute, progress.quiet)
-    echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
+    if timing:
+        echo(f"timed in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
 
     row = {
         **CELLS.identity(cell),

@@ -118,12 +118,15 @@ def deployed(path: Path, tasks: tuple[str, ...] | None) -> tuple[Cell, Model]:
 def time_cell(
     model: Model, cell: Cell, root: Path, compute: Compute, quiet: Quiet
 ) -> tuple[dict[str, Any], float]:
-    """The latency protocol over the evaluation split's frames; seconds that it took.
+    """The latency protocol over the evaluation split's frames, nothing where it has no passes;
+    seconds that it took.
 
     On all of this process's cores, which are more than its threads where cells run side by side;
     those hold still meanwhile.
     """
     recipe = cell.recipe
+    if recipe.latency.passes == 0:
+        return {}, 0.0
     measured = model.tasks if recipe.evaluate.split != NOTHING else ()  # else there is no truth
     samples = open_samples(recipe, measured, recipe.evaluate.images, root, training=False)
     frames = [samples.sample(index, None) for index in range(min(len(samples), FRAMES))]
@@ -161,4 +164,7 @@ def time_again(
         row["code"]["time"] = code
     row["env_of_latency"] = provenance.environment(compute.device)
     write_json(run_dir / "row.json", row)
-    echo(f"timed again in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
+    if timing:
+        echo(f"timed again in {latency_s:.0f} s: {timing['latency.mean_ms']:.1f} ms a frame")
+    else:
+        echo("nothing to time: recipe.latency.passes is 0")

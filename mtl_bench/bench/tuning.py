@@ -1,9 +1,10 @@
 """Trials: what tuning a grid's lines costs, which settings it chooses, and the results of those.
 
 Every line of a grid with a section [tune], its baseline among them, gets as many trials on every
-problem as any other. A trial is a cell like others, on a seed of its own and evaluated on the split
-val; the results are cells with the chosen settings, on the grid's seeds and the recipe's own split,
-which nothing was chosen by. A line is chosen for once all its trials have ended.
+problem as any other. A trial is a cell like others, on a seed of its own, evaluated on the split
+val and not timed. The results are cells with the chosen settings, on the grid's seeds and the
+recipe's own split, which nothing was chosen by. A line is chosen for once all its trials have
+ended.
 """
 
 import functools
@@ -275,7 +276,12 @@ def _text(value: Any) -> str:
 
 
 def _trial_cell(base: Cell, seed: int, values: Mapping[str, Any]) -> Cell:
-    judged = replace(base.recipe, evaluate=replace(base.recipe.evaluate, split=SPLIT))
+    evaluate, latency = base.recipe.evaluate, base.recipe.latency
+    judged = replace(
+        base.recipe,
+        evaluate=replace(evaluate, split=SPLIT),
+        latency=replace(latency, passes=0),  # nobody asks, and cells beside it would hold still
+    )
     return set_values(replace(base, recipe=judged, seed=seed), values)
 
 

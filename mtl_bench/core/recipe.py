@@ -219,7 +219,7 @@ class Evaluate(Checked):
 class Latency(Checked):
     """How long to time; the paper uses 500 passes."""
 
-    passes: Annotated[Count, "timed ones"] = 500
+    passes: Annotated[Whole, "timed ones; 0: none, and no latency"] = 500
     warmup: Annotated[Whole, "passes before them"] = 10
     height: Annotated[Count | None, "pixels; none: the recipe's input"] = None
     width: Annotated[Count | None, "as height"] = None

@@ -49,8 +49,8 @@ class Scales(InMemory):
         self.pixels_N3HW, functions_NK = _made(self.functions, data, self.split)
         scale_K = data.norm_ratio ** np.linspace(-0.5, 0.5, data.heads)
         self.truth_NK = torch.from_numpy((functions_NK * scale_K).astype(np.float32))
-        columns = zip(names, self.truth_NK.split(1, dim=1), strict=False)
-        self.columns = {name: truth_N1 for name, truth_N1 in columns if name in self.needs}
+        truth = zip(names, self.truth_NK.split(1, dim=1), strict=False)
+        self.numbers = {name: truth_N1.unbind() for name, truth_N1 in truth if name in self.needs}
         self.names = [f"{self.split}{number}" for number in range(len(self.truth_NK))]
 
     @staticmethod
@@ -66,7 +66,7 @@ class Scales(InMemory):
         index = int(name.removeprefix(self.split))
         return DecodedFrame(
             images_N3HW=[self.pixels_N3HW[index]],
-            fields={name: truth_N1[index] for name, truth_N1 in self.columns.items()},
+            fields={name: number_1[index] for name, number_1 in self.numbers.items()},
         )
 
 

@@ -56,6 +56,13 @@ def test_a_smoke_cell(tmp_path, recipe, methods, settings):
     assert row["metric"]["latency.mean_ms"] > 0
 
 
+def test_a_cell_without_passes_is_not_timed(tmp_path):
+    (row,) = rows("scales", tmp_path, "method=fixed", ["recipe.latency.passes=0"])
+    assert "regress.y0.unexplained" in row["metric"]
+    assert not [key for key in row["metric"] if key.startswith("latency.")]
+    assert row["time"]["latency_s"] == 0
+
+
 def test_a_report_of_numbers(tmp_path):
     from mtl_bench.report.grid import build
 
@@ -65,7 +72,7 @@ def test_a_report_of_numbers(tmp_path):
     grid = load_grid("methods", recipe="conflict", smoke=True, settings=[*SMALL, "method=fixed"])
     page = build(grid, found, tmp_path / "report", runs_root=tmp_path / "runs", command="x")
     table = (page.parent / "table.md").read_text()
-    assert "c3 1 - R2" in table
-    assert "c4" not in table
+    assert "c7 1 - R2" in table
+    assert "c8" not in table
     assert "left accuracy" not in page.read_text()
     assert not (page.parent / "samples.png").exists()

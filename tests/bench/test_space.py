@@ -42,7 +42,7 @@ def test_shares_are_of_the_tasks_and_add_up_to_one():
     assert all(set(shares) == set(CELL.tasks) for shares in drawn)
     assert all(sum(shares.values()) == pytest.approx(1, abs=0.01) for shares in drawn)
     mean = sum(shares["regress:c0"] for shares in drawn) / len(drawn)
-    assert mean == pytest.approx(1 / 4, abs=0.05)
+    assert mean == pytest.approx(1 / 8, abs=0.05)
 
 
 def test_what_a_line_sets_itself_is_not_tuned_and_parts_are_set_by_part():

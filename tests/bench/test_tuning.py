@@ -33,6 +33,7 @@ def test_every_line_has_as_many_trials_judged_on_val_with_seeds_of_their_own(gri
         ["fixed", "scalarised", "cagrad", "single-task"], 3
     )
     assert all(trial.cell.recipe.evaluate.split == "val" for trial in tuning.trials(grid))
+    assert all(trial.cell.recipe.latency.passes == 0 for trial in tuning.trials(grid))
     assert {trial.cell.seed for trial in tuning.trials(grid)} == {100}
     assert {trial.problem for trial in tuning.trials(grid)} == {"conflict"}
     assert len({trial.cell.id for trial in tuning.trials(grid)}) == 12
@@ -222,7 +223,7 @@ def test_ablate_tries_chooses_and_reports_and_a_second_start_goes_on(tmp_path, r
     stop[0] = 10**6
     result = call("ablate", file, tmp_path)
     assert result.exit_code == 0, result.output
-    assert len(cells) == len({cell.id for cell in cells}) == 4 * 3 + 3 * 4 + 7 * 3 + 7 * 5
+    assert len(cells) == len({cell.id for cell in cells}) == 4 * 3 + 3 * 8 + 7 * 3 + 7 * 9
     out = tmp_path / "reports" / "mine"
     table = (out / "table.md").read_text()
     assert "Chosen settings" in table

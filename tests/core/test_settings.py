@@ -48,7 +48,7 @@ CELL = Cell(Recipe(), "tiny", "famo")
         ("recipe.evaluate.top_k=0", "must be >= 1, not 0"),
         ("recipe.evaluate.top_k=1000", "must be <= 999, not 1000"),
         ("recipe.evaluate.min_depth_m=90", "must be below max_depth_m"),
-        ("recipe.latency.passes=0", "'recipe.latency.passes' must be >= 1, not 0"),
+        ("recipe.latency.passes=-1", "'recipe.latency.passes' must be >= 0, not -1"),
         ("recipe.data.train_frames=most", "must be published or all, not 'most'"),
         ("seed=-1", "'seed' must be >= 0, not -1"),
         ('tasks=["depth", "depth"]', "'tasks' must be without repetitions"),

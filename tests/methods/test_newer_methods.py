@@ -10,7 +10,7 @@ import sys
 import pytest
 import torch
 from support.methods import head_weights, step_of, weights
-from support.terms import TERMS
+from support.terms import TERMS, WHOLE_TASKS
 
 from mtl_bench.bench.check.methods import LOSSES, Quadratics
 from mtl_bench.core import plugins
@@ -175,6 +175,25 @@ def gramians(count, tasks=3):
 def composed(name, tasks=3, **settings):
     terms = [Term(f"task{i}", "depth", "regression", 1.0) for i in range(tasks)]
     return compose(name, settings, terms, seed=0)
+
+
+def test_relative_shares_are_of_the_tasks_first_losses_for_good():
+    terms = (Term("a", "one", "regression", 1.0), Term("b", "one", "regression", 10.0))
+    terms += (Term("c", "two", "regression", 1.0),)
+    shares = {"one": 3.0, "two": 1.0}
+    method = plugins.load("methods", "scalarised")(terms, shares=shares, relative=True)
+    first_K = torch.tensor([2.0, 0.4, 100.0])  # of tasks 2 + 10 * 0.4 = 6, and 100
+    one, two = 2 * 0.75 / 6, 2 * 0.25 / 100
+    expected = torch.tensor([one, 10 * one, two])
+    torch.testing.assert_close(weights(method, first_K), expected)
+    torch.testing.assert_close(weights(method, first_K / 7), expected)
+
+
+def test_relative_shares_wait_for_a_task_that_is_absent_at_first():
+    method = plugins.load("methods", "scalarised")(WHOLE_TASKS, relative=True)
+    torch.testing.assert_close(weights(method, torch.tensor([0.5])), torch.tensor([2.0]))
+    found_2 = weights(method, torch.tensor([0.1, 4.0]))
+    torch.testing.assert_close(found_2, torch.tensor([2.0, 0.25]))
 
 
 def test_cr_averages_the_weights_of_what_it_is_around():
