@@ -86,17 +86,24 @@ class Processes(Ranks):
     """Several ranks; `with` joins and leaves them.
 
     Args:
-        address: host and port of the store; None: rank 0 starts all others, on this machine.
+        address: host and port of the store; None: rank 0 starts all others, on this machine, when
+            it first has something to tell.
     """
 
     def __init__(self, rank: int, size: int, local: int, address: tuple[str, int] | None):
         self.rank, self.size, self.local, self.address = rank, size, local, address
         self._others: list[subprocess.Popen[bytes]] = []
-        self._joined = False
         self._tasks = 0
+        self._met = self._joined = False
         self._over = threading.Event()
 
     def __enter__(self) -> Self:
+        if self.address is not None:
+            self._meet()
+        return self
+
+    def _meet(self) -> None:
+        """At the store, which rank 0 serves."""
         import socket
 
         from torch.distributed import TCPStore  # type: ignore[attr-defined]
@@ -121,7 +128,7 @@ class Processes(Ranks):
         self._place = host, port
         self._watching = threading.Thread(target=self._watch, args=(beats,), daemon=True)
         self._watching.start()
-        return self
+        self._met = True
 
     def __exit__(
         self,
@@ -130,13 +137,15 @@ class Processes(Ranks):
         trace: TracebackType | None,
     ) -> None:
         """Say why to the others; rank 0 waits for them, as it serves their store."""
+        if not self._met:
+            return
         self._over.set()
         self._watching.join()
         stopped = isinstance(error, KeyboardInterrupt)
         why = INTERRUPTED if stopped else "" if error is None else _line(error)
         with contextlib.suppress(RuntimeError):  # the store of a rank 0 that was killed
             self._store.set(f"left/{self.rank}", why)
-            if self.first and (self._joined or self.address is not None):
+            if self.first:
                 end = time.monotonic() + LEAVE_S
                 left = [f"left/{rank}" for rank in range(1, self.size)]
                 while time.monotonic() < end and not self._store.check(left):
@@ -212,8 +221,9 @@ class Processes(Ranks):
     # --- what rank 0 tells ------------------------------------------------------------------------
 
     def tell(self, task: dict[str, Any], device: "torch.device") -> None:
-        if self.address is None and not self._others:
+        if not self._met:
             self._enough(device)
+            self._meet()
             self._others = [self._started(rank) for rank in range(1, self.size)]
         self._store.set(f"task/{self._tasks}", json.dumps(task))
         self._tasks += 1
@@ -310,8 +320,6 @@ class Processes(Ranks):
         while not lost and not self._over.wait(BEAT_S):
             try:
                 store.add(f"beat/{self.rank}", 1)
-                if self.address is None and not self._others:
-                    continue  # nobody has been started yet
                 for rank in list(others):
                     if store.check([f"left/{rank}"]):
                         others.remove(rank)

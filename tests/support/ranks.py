@@ -25,6 +25,8 @@ def serve(rank: int, size: int, port: int, connection) -> None:
             except Exception as error:
                 traceback.print_exc()
                 connection.send((None, f"{type(error).__name__}: {error}"))
+        if not ranks.first:
+            assert ranks.told() is None  # rank 0 is the first to leave
 
 
 class Asked:
