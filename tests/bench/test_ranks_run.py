@@ -9,7 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from support import slurm_node
+from support.training import curve
 from typer.testing import CliRunner
 
 from mtl_bench.bench import launch, store
@@ -18,6 +20,7 @@ from mtl_bench.cli import grid
 from mtl_bench.cli.app import app
 from mtl_bench.core import ranks
 from mtl_bench.core.config import Cell, load_recipe, override
+from mtl_bench.core.device import choose_device
 from mtl_bench.core.files import read_json
 from mtl_bench.core.ranks import ALONE, Processes, joined
 from mtl_bench.train import checkpoint
@@ -151,6 +154,22 @@ def test_a_cell_of_a_launcher_is_no_rank_of_the_launchers(environment, monkeypat
         assert found is ALONE
 
 
+def test_a_rank_has_a_gpu_of_its_own(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    third = Processes(2, 4, 2, ("n1", 1))
+    for count, device in ((4, "cuda:2"), (1, "cuda:0")):  # all are seen, or its own alone
+        monkeypatch.setattr(torch.cuda, "device_count", lambda count=count: count)
+        assert choose_device("cuda", third) == torch.device(device)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(ValueError, match="rank 2 finds 2 GPUs here"):
+        choose_device("cuda", third)
+    with (
+        Processes(0, 4, 0, None) as first,
+        pytest.raises(ValueError, match=r"4 ranks, but .* 2 GPUs"),
+    ):
+        first.tell({}, torch.device("cuda"))
+
+
 def test_gpus_go_to_cells_in_equal_numbers():
     assert together(("0", "1", "2", "3", "4"), 2) == ("0,1", "2,3")
     assert together(("0", "GPU-1"), 1) == ("0", "GPU-1")
@@ -235,6 +254,28 @@ def test_a_killed_rank_ends_the_others_and_the_cell_goes_on(who, tmp_path):
     for key, value in expected.items():
         if ".running_" not in key:
             assert value.equal(model[key]), key
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_two_gpus_are_one(tmp_path):
+    losses = []
+    for number in ("1", "2"):
+        (tmp_path / number).mkdir()
+        run(tmp_path / number, *SMOKE, "--device", "cuda", "--ranks", number)
+        losses.append(
+            [float(row["total"]) for row in curve(only(tmp_path / number, "curve.csv").parent)]
+        )
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_grid_of_cells_on_two_ranks(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'recipe = "smoke"\n[axes]\nmethod = ["fixed"]\nbackbone = ["tiny"]\n'
+    )
+    run(tmp_path, "ablate", "--grid", "mine.toml", *PARTS, "--ranks", "2", "--device", "cpu")
+    assert read_json(only(tmp_path, "row.json"))["env"]["ranks"] == 2
 
 
 @pytest.mark.slow

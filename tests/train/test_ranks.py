@@ -145,6 +145,15 @@ def test_bfloat16_too(pair, tmp_path):
 # --- what every rank agrees on --------------------------------------------------------------------
 
 
+def long_and_short(ranks, cell) -> list[str]:
+    return ranks.gather(f"{ranks.rank}" * (1 + 10000 * ranks.rank))
+
+
+def test_values_of_any_length_are_gathered_by_rank(pair):
+    expected = ["0", "1" * 10001]
+    assert pair(long_and_short, trunk_cell("fixed")) == [expected, expected]
+
+
 def test_a_loss_that_is_not_finite_stops_all_ranks_alike(pair, smoke_root, tmp_path):
     settings = ("recipe.optim.lr=1e30", "recipe.optim.clip=none", "recipe.optim.warmup_steps=0")
     pair(trained, network_cell("fixed", *settings), smoke_root, tmp_path / "run", fails=True)
