@@ -1,6 +1,7 @@
 """A cell on several ranks is the cell in as many parts."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -103,6 +104,17 @@ def test_two_ranks_are_two_parts_of_the_network(method, pair, smoke_root, tmp_pa
 @pytest.mark.parametrize("method", ON_A_TRUNK)
 def test_two_ranks_are_two_parts_of_a_trunk(method, pair, tmp_path):
     compare(pair, trunk_cell(method), scales_root(), tmp_path)
+
+
+@pytest.mark.parametrize("method", ["famo", "upgrad"])
+def test_replayed_weights_train_two_ranks_too(method, pair, tmp_path):
+    torch.set_num_threads(1)
+    origin, root = trunk_cell(method), scales_root()
+    run(origin, root, tmp_path / "record")
+    cell, record = replace(origin, replay="mean"), {"record": tmp_path / "record" / "curve.csv"}
+    pair(trained, cell, root, tmp_path / "ranks", record)
+    run(cell, root, tmp_path / "parts", **record)
+    assert_same(tmp_path / "ranks", tmp_path / "parts")
 
 
 @pytest.mark.slow
