@@ -176,7 +176,7 @@ def table(results: Sequence[Result], costs: Mapping[str, str], base_mib: float) 
 
 
 def verdicts(results: Sequence[Result], costs: Mapping[str, str]) -> list[str]:
-    """What issue 4 asks for, by the medians."""
+    """Whether the two aims are met, by the medians."""
     plain = [r for r in results if costs[r.name] == costs[BASE]]
     both = [r for r in results if r.torchjd_s]
     found = []

@@ -1,6 +1,7 @@
 """Results from elsewhere: of other runs folders, and of a grid's rows kept as one file.
 
-What comes in is what `store` calls done by the code of today, and goes where nothing good is yet.
+What comes in is what `store` calls done by the code of today, and goes where nothing good is yet;
+on request also what other code made, where nothing is.
 A pack is text, compressed by xz: a line that says what it is, then a line a job, in the order of
 their folders' names. `xzcat FILE` shows it; the same rows make the same bytes.
 """
@@ -9,7 +10,7 @@ import json
 import lzma
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ class Found:
     row: dict[str, Any]  # of a failed cell empty
     failed: Mapping[str, Any] = field(default_factory=dict)  # FAILED -> what these files say
     beside: Mapping[str, Path | str] = field(default_factory=dict)  # files, or their text
+    stale: bool = False  # made by other code
 
     @property
     def name(self) -> str:
@@ -60,26 +62,39 @@ class Left:
 
 
 def from_folder(
-    runs: Path, weights: bool = False, failures: bool = False
+    runs: Path, weights: bool = False, failures: bool = False, stale: bool = False
 ) -> Iterator[Found | Left]:
     """What is in a runs folder, by name.
 
     Args:
         weights: take checkpoints along.
         failures: take cells, too, that failed by the code of today.
+        stale: take rows, too, that other code made.
     """
     for path in sorted(runs.iterdir()):
         if (path / "cell.json").is_file() or (path / "row.json").is_file():
-            yield _readable(path.name, partial(_of_cell, path, weights, failures))
+            yield _judged(path.name, partial(_of_cell, path, weights, failures), stale)
     for path in sorted((runs / "latency").glob("*.json")):
-        yield _readable(f"latency/{path.stem}", partial(_of_timing, path))
+        yield _judged(f"latency/{path.stem}", partial(_of_timing, path), stale)
 
 
-def _readable(name: str, read: Callable[[], Found | Left]) -> Found | Left:
+def _judged(name: str, read: Callable[[], Found | Left], stale: bool) -> Found | Left:
+    """What can be read, as the store judges it: done by the code of today, or not."""
     try:
-        return read()
+        found = read()
+        return found if isinstance(found, Left) else _by_the_store(found, stale)
     except ValueError as error:
         return Left(name, "unreadable", " ".join(str(error).split()))
+
+
+def _by_the_store(found: Found, stale: bool) -> Found | Left:
+    if found.failed:
+        changed = store.changed(found.failed["code.json"], found.job)
+        return Left(found.name, "stale", provenance.in_words(changed)) if changed else found
+    state = store.state_of(found.row, found.job)
+    if state.word == "done" or (stale and state.word == "stale"):
+        return replace(found, stale=state.word == "stale")
+    return Left(found.name, state.word, state.why)
 
 
 def _of_cell(directory: Path, weights: bool, failures: bool) -> Found | Left:
@@ -89,7 +104,7 @@ def _of_cell(directory: Path, weights: bool, failures: bool) -> Found | Left:
         files = {name: read_json(directory / name) for name in FAILED}
         failed = {name: values for name, values in files.items() if values is not None}
         if failures and len(failed) == len(FAILED):
-            return _judged(Found(cell, {}, failed))
+            return Found(cell, {}, failed)
         why = str(failed.get("failed.json", {}).get("error", ""))
         return Left(directory.name, "failed" if "failed.json" in failed else "unfinished", why)
     names = [*BESIDE, *(WEIGHTS if weights else ())]
@@ -100,7 +115,7 @@ def _of_cell(directory: Path, weights: bool, failures: bool) -> Found | Left:
         from mtl_bench.train import checkpoint  # takes seconds, for torch
 
         checkpoint.require(directory / "last.pt", cell)
-    return _judged(Found(cell, row, beside=beside))
+    return Found(cell, row, beside=beside)
 
 
 def _of_timing(path: Path) -> Found | Left:
@@ -110,51 +125,46 @@ def _of_timing(path: Path) -> Found | Left:
     timing = from_dict(Timing, values)
     row = store.read_row(path, timing)
     assert row is not None
-    return _judged(Found(timing, row))
+    return Found(timing, row)
 
 
-def _judged(found: Found) -> Found | Left:
-    """As the store judges a row: done by the code of today, or not."""
-    if found.failed:
-        changed = store.changed(found.failed["code.json"], found.job)
-        return Left(found.name, "stale", provenance.in_words(changed)) if changed else found
-    state = store.state_of(found.row, found.job)
-    return found if state.word == "done" else Left(found.name, state.word, state.why)
-
-
-def read_pack(path: Path) -> Iterator[Found | Left]:
-    """What is in a pack.
+def read_pack(path: Path, stale: bool = False) -> Iterator[Found | Left]:
+    """What is in a pack; `stale` as above.
 
     Raises:
         ValueError: it is no pack, of a newer version, or damaged.
     """
     for number, values in enumerate(_lines(path), 2):
-        yield _readable(f"line {number} of {path}", partial(_of_line, values))
+        yield _judged(f"line {number} of {path}", partial(_of_line, values), stale)
 
 
-def _of_line(values: Mapping[str, Any]) -> Found | Left:
+def _of_line(values: Any) -> Found:
+    if not isinstance(values, dict):
+        raise ValueError("no job with its row")
     kind = next((kind for kind in KINDS if isinstance(values.get(kind), dict)), None)
     if kind is None or not isinstance(row := values.get("row"), dict):
         raise ValueError("no job with its row")
     job = from_dict(KINDS[kind], values[kind])
     failed = {name: values[name] for name in FAILED if isinstance(values.get(name), dict)}
     if len(failed) == len(FAILED):
-        return _judged(Found(job, {}, failed))
+        return Found(job, {}, failed)
     if wrong := store.fault(row, job):
         raise ValueError(f"the row is {wrong}")
-    return _judged(Found(job, row, beside={k: values[k] for k in (CURVE,) if k in values}))
+    if not isinstance(values.get(CURVE, ""), str):
+        raise ValueError(f"its {CURVE} is no text")
+    return Found(job, row, beside={k: values[k] for k in (CURVE,) if k in values})
 
 
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """What the jobs' lines say."""
+def _lines(path: Path) -> Iterator[Any]:
+    """What the lines behind the first say, each a value of JSON."""
     try:
         with lzma.open(path, "rt", encoding="utf-8") as file:
             head = json.loads(next(file, "null"))
             if not isinstance(head, dict) or head.get("format") != FORMAT["format"]:
                 raise ValueError("it begins with other words")
             if head.get("version") != FORMAT["version"]:
-                version = head.get("version")
-                raise ValueError(f"it is of version {version}, and this one reads 1")
+                own, its = FORMAT["version"], head.get("version")
+                raise ValueError(f"it is of version {its}, and this one reads {own}")
             yield from map(json.loads, file)
     except (lzma.LZMAError, EOFError, ValueError) as error:
         raise ValueError(
@@ -187,7 +197,7 @@ def write_pack(path: Path, jobs: Iterable[Found], curves: bool = False) -> None:
 
 
 def put(found: Found, runs: Path) -> Left | None:
-    """Take a result into a runs folder, where there is no good one; a stale, failed or unfinished
+    """Take a result into a runs folder, where there is none as good; a stale, failed or unfinished
     one is set aside. Of one that is here already, files that are not here are taken.
 
     Returns:
@@ -203,7 +213,7 @@ def put(found: Found, runs: Path) -> Left | None:
 
 
 def _put_timing(found: Found, runs: Path) -> Left | None:
-    if store.stored(found.job, runs).word == "done":
+    if store.stored(found.job, runs).word in _as_good(found):
         return Left(found.name, "already here")
     file = kind_of(found.job).row_file(found.job, runs)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -215,12 +225,13 @@ def _put_cell(found: Found, runs: Path) -> Left | None:
     directory, here = store.run_dir(found.job, runs), store.stored(found.job, runs)
     if found.failed and here.word != "missing":
         return Left(found.name, "already here", "tried here, too")
-    if here.word == "done" and here.row != found.row:
+    good = here.word in _as_good(found)
+    if good and here.row != found.row:
         return Left(found.name, "already here")
     lacking = [name for name in found.beside if not (directory / name).is_file()]
-    if here.word == "done" and not lacking:
+    if good and not lacking:
         return Left(found.name, "already here")
-    if here.word != "done":
+    if not good:
         store.set_aside(directory, "a collected result takes its place")
         write_json(directory / "cell.json", to_dict(found.job))
         lacking = list(found.beside)
@@ -228,9 +239,14 @@ def _put_cell(found: Found, runs: Path) -> Left | None:
         _copy(found.beside[name], directory / name)
     for name, values in found.failed.items():
         write_json(directory / name, values)
-    if here.word != "done" and not found.failed:
+    if not good and not found.failed:
         write_json(directory / "row.json", found.row)  # last: it is what makes a result
     return None
+
+
+def _as_good(found: Found) -> tuple[str, ...]:
+    """Words of the store for what a result must not replace."""
+    return ("done", "stale") if found.stale else ("done",)
 
 
 def _copy(source: Path | str, to: Path) -> None:
@@ -245,9 +261,16 @@ def _copy(source: Path | str, to: Path) -> None:
 
 
 def collect(
-    sources: Iterable[Path], runs: Path, weights: bool = False, failures: bool = False
+    sources: Iterable[Path],
+    runs: Path,
+    weights: bool = False,
+    failures: bool = False,
+    stale: bool = False,
 ) -> tuple[int, list[Left]]:
     """Take all that fits from runs folders and packs; how many were taken, and the rest.
+
+    Args:
+        weights, failures, stale: as in `from_folder`.
 
     Raises:
         ValueError: a source that is neither, before anything is taken.
@@ -263,7 +286,10 @@ def collect(
     taken, left = 0, []
     for source in sources:
         folder = source.is_dir()
-        for each in from_folder(source, weights, failures) if folder else read_pack(source):
+        every = (
+            from_folder(source, weights, failures, stale) if folder else read_pack(source, stale)
+        )
+        for each in every:
             why = each if isinstance(each, Left) else put(each, runs)
             taken += why is None
             left += [] if why is None else [why]
@@ -276,16 +302,18 @@ def pack(
     jobs: Iterable[Job] | None = None,
     curves: bool = False,
     failures: bool = False,
+    stale: bool = False,
 ) -> tuple[int, list[Left]]:
     """Write a pack of what is done in a runs folder; how many jobs, and what was left out.
 
     Args:
         jobs: of these alone; without them, of all that are there.
+        failures, stale: as in `from_folder`.
 
     Raises:
         ValueError: there is none.
     """
-    every = list(from_folder(runs, failures=failures)) if runs.is_dir() else []
+    every = list(from_folder(runs, failures=failures, stale=stale)) if runs.is_dir() else []
     if jobs is not None:
         names = {job.slug for job in jobs}
         every = [each for each in every if each.name in names]

@@ -201,7 +201,7 @@ def load_grid(
         recipe: in place of the grid's; where it has a backbone of its own, that, too.
         seeds: seeds 0 .. seeds - 1 in place of the grid's.
         smoke: the file's `smoke_recipe` (without one: `smoke`) or its [smoke], or some steps of
-            `recipe`, under a name that says so.
+            `recipe`, of a suite or of what is tuned, under a name that says so.
         settings: `key=value` for every job; stands in place of an axis or of a row's value, and is
             what a row's "2x" multiplies.
         pretrained: as in `Cell`, for every cell.
@@ -391,10 +391,12 @@ def _of_cells(
         axes["seed"] = axes.get("seed", (0,))[:1]
     suite = sections.suite(file, recipe)
     sections.check_rows(file, axes, suite)
-    key, otherwise = ("smoke_recipe", "smoke") if smoke else ("recipe", "small")
+    shortened = smoke and (recipe or suite or (tune and "smoke_recipe" not in file.values))
+    apart = smoke and not shortened
+    key, otherwise = ("smoke_recipe", "smoke") if apart else ("recipe", "small")
     first = next(iter(suite), None)
     start = load_recipe(first or recipe or str(file.values.get(key, otherwise)))
-    start = _smoke_of(start) if smoke and (recipe or suite) else start
+    start = _smoke_of(start) if shortened else start
     if recipe and start.backbone and not suite:
         settings = [f"backbone={start.backbone}", *settings]
     given = {setting.partition("=")[0].strip() for setting in settings}

@@ -5,7 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 from mtl_bench.bench.jobs import NOTHING
-from mtl_bench.bench.space import DEFAULT, Tune, check, draws
+from mtl_bench.bench.space import DEFAULT, SPLIT, TUNED, Tune, check, draws, of_method
+from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell
 from mtl_bench.core.plain import from_dict
 from mtl_bench.core.toml_file import TomlFile
@@ -23,11 +24,17 @@ def tune(file: TomlFile, smoke: bool) -> Tune | None:
     if values is None:
         return None
     places = (("tune.space", 0), ("tune", 0))
-    for key, where in values.get("space", {}).items():
+    space = values.get("space", {})
+    if not isinstance(space, dict):
+        raise file.error(f"write it as [tune.space], a section, not {space!r}", "space", *places)
+    for key, where in space.items():
         try:
             check(key, where)
         except ValueError as error:
             raise file.error(str(error), key, *places) from error
+        if not key.startswith(TUNED):
+            message = f"trials cannot set '{key}', only what begins with {', '.join(TUNED)}"
+            raise file.error(message, key, *places)
     try:
         found = from_dict(Tune, {"space": DEFAULT, **values}, "tune.")
     except ValueError as error:
@@ -44,7 +51,7 @@ def check_tuned(
     """Results have other seeds than trials and another split, and a trial can be set.
 
     Raises:
-        ValueError: otherwise, with its line.
+        ValueError: otherwise, with its line; what a method declares, with its file.
     """
     both = sorted({cell.seed for cell in cells}.intersection(tune.seeds))
     if both:
@@ -53,37 +60,53 @@ def check_tuned(
     for cell in cells:
         if cell.recipe.evaluate.split != "test":
             raise file.error(
-                f"trials are judged on the split val, and recipe {cell.recipe.name} reports its "
-                f"split {cell.recipe.evaluate.split}: set recipe.evaluate.split to test",
+                f"trials are judged on the split {SPLIT}, and recipe {cell.recipe.name} reports "
+                f"its split {cell.recipe.evaluate.split}: set recipe.evaluate.split to test",
                 "trials",
                 ("tune", 0),
             )
+    for name in sorted({name for cell in cells for name in plugins.part_names(cell.method)}):
+        of_method(name)
     places = (("tune.space", 0), ("tune", 0))
-    try:
-        drawn = draws(tune, cells[0])[1:]
-    except ValueError as error:
-        key = next((key for key in tune.space if key in str(error)), "")
-        raise file.error(str(error), key, *places) from error
-    for values in drawn:
-        own = {key: value for key, value in values.items() if key in tune.space}
-        set_values(cells[0], own, *places)
+    for cell in {cell.recipe.name: cell for cell in reversed(cells)}.values():
+        try:
+            drawn = draws(tune, cell)[1:]
+        except ValueError as error:
+            key = next((key for key in tune.space if key in str(error)), "")
+            raise file.error(str(error), key, *places) from error
+        for values in drawn:
+            own = {key: value for key, value in values.items() if key in tune.space}
+            set_values(cell, own, *places)
 
 
 def suite(file: TomlFile, recipe: str | None) -> dict[str, Mapping[str, Any]]:
     """Recipe -> what the suite sets of its cells; of the one that was asked for, where one was.
 
     Raises:
-        ValueError: an entry that is no recipe's name and no table with one.
+        ValueError: an entry that is no recipe's name and no table with one, one that stands twice,
+            no entry, or a recipe beside the suite.
     """
+    if "suite" not in file.values:
+        return {}
     found: dict[str, Mapping[str, Any]] = {}
-    for entry in file.values.get("suite", []):
+    for entry in file.values["suite"]:
         values = dict(entry) if isinstance(entry, dict) else {"recipe": entry}
         name = values.pop("recipe", None)
         if not isinstance(name, str):
             message = 'a suite lists recipes: "NAME" or { recipe = "NAME", KEY = VALUE }'
             raise file.error(message, "suite", ("", 0))
+        if name in found:
+            raise file.error(f"recipe '{name}' stands twice in the suite", "suite", ("", 0))
         found[name] = values
-    return {recipe: found.get(recipe, NOTHING)} if found and recipe else found
+    if not found:
+        raise file.error('a suite needs a recipe: suite = ["NAME", ...]', "suite", ("", 0))
+    tables = [(("", 0), file.values), (("axes", 0), file.values.get("axes", {}))]
+    tables += [(("row", index), row) for index, row in enumerate(file.values.get("row", []))]
+    for place, table in tables:
+        for key in ("recipe", "smoke_recipe"):
+            if key in table:
+                raise file.error(f"leave out '{key}': the suite names the recipes", key, place)
+    return {recipe: found.get(recipe, NOTHING)} if recipe else found
 
 
 def check_rows(file: TomlFile, axes: Mapping[str, Any], suite: Mapping[str, Any]) -> None:

@@ -1,14 +1,14 @@
 """What trials may set, and the quasi-random values that they take.
 
-A space says of each key that --set takes where its values lie:
+A space says of keys that --set takes, those that begin as in TUNED, where their values lie:
 
     "recipe.optim.lr" = { log = ["0.1x", "10x"] }       between two numbers, evenly in the logarithm
     "method.alpha" = { uniform = [0.1, 0.9] }           between two numbers; whole where both are
     "recipe.optim.weight_decay" = [0.0, 1e-5, 1e-4]     one of these
 
-"0.1x" is times the recipe's number. A method's file says the same of its hyper-parameters, in
-`space`, where { "dirichlet": 1.0 } are shares of the tasks that add up to 1. What a line sets
-itself is not tuned. Trial 0 changes nothing: it is the published setting.
+"0.1x" is times the recipe's number. A method's class says the same of its hyper-parameters, in
+`space`, where { "dirichlet": 1.0 } are shares of the tasks that add up to 1; a subclass has its
+base's. What a line sets itself is not tuned. Trial 0 changes nothing: it is the published setting.
 """
 
 import math
@@ -20,11 +20,16 @@ from typing import Annotated, Any
 
 from mtl_bench.core import plugins
 from mtl_bench.core.config import Cell
-from mtl_bench.core.plain import DISTINCT, SOME, Checked, to_dict
+from mtl_bench.core.plain import DISTINCT, SOME, Checked, did_you_mean, to_dict
 from mtl_bench.core.recipe import Count, Whole
 
 TIMES = re.compile(r"(\d+\.?\d*)x")  # "2x", "0.5x"
 RANGES = ("log", "uniform")
+TUNED = (  # what begins a key that trials may set: none is what lines and problems are told by
+    *("recipe.augment.", "recipe.network.", "recipe.loss.", "recipe.optim.", "recipe.pseudo."),
+    *("method.", "backbone."),
+)
+SPLIT = "val"  # that trials are judged on
 DRAW = 17  # of the scrambling: another one would be other trials
 DEFAULT: Mapping[str, Any] = MappingProxyType(
     {
@@ -65,6 +70,27 @@ def check(key: str, where: Any) -> None:
         )
 
 
+def of_method(name: str) -> dict[str, Any]:
+    """What a method declares, or a class that it derives from, by hyper-parameter.
+
+    Raises:
+        ValueError: no such method, or what no trial could be drawn from.
+    """
+    space, path = plugins.read_attribute("methods", name, "space"), plugins.path_of("methods", name)
+    if not isinstance(space, dict):
+        raise ValueError(f"{path}: space is {{HYPER-PARAMETER: VALUES, ...}}, not {space!r}")
+    known = plugins.arguments("methods", name)
+    for key, where in space.items():
+        if key not in known:
+            like = did_you_mean(str(key), known)
+            raise ValueError(f"{path}: space has '{key}', no argument of the constructor{like}")
+        try:
+            check(key, where)
+        except ValueError as error:
+            raise ValueError(f"{path}: in space, {error}") from error
+    return space
+
+
 def draws(tune: Tune, cell: Cell) -> list[dict[str, Any]]:
     """The settings of every trial of a cell, by key of --set; of trial 0 none."""
     space = {**tune.space, **_of_method(cell)}
@@ -101,12 +127,10 @@ def value_of(cell: Cell, key: str) -> Any:
 
 def _of_method(cell: Cell) -> dict[str, Any]:
     """What the cell's method declares, less what the cell sets."""
-    names, found = plugins.part_names(cell.method), {}
+    names, found = plugins.part_names(cell.method), dict[str, Any]()
     for name in names:
         prefix = "method." if len(names) == 1 else f"method.{name}."
-        for key, where in plugins.attributes("methods", name).get("space", {}).items():
-            check(key, where)
-            found[prefix + key] = where
+        found |= {prefix + key: where for key, where in of_method(name).items()}
     return {key: where for key, where in found.items() if value_of(cell, key) is None}
 
 

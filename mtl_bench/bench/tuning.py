@@ -20,14 +20,14 @@ from mtl_bench.bench.data_state import Data
 from mtl_bench.bench.grid import Grid, baseline_cell
 from mtl_bench.bench.jobs import CELLS, Job, with_parents
 from mtl_bench.bench.references import baselines
-from mtl_bench.bench.space import draws, value_of
+from mtl_bench.bench.space import SPLIT, draws, value_of
 from mtl_bench.core import plugins
 from mtl_bench.core.columns import Column
 from mtl_bench.core.config import Cell, set_values
 from mtl_bench.core.quality import quality
 from mtl_bench.evaluate.delta import log_gain
 
-SPLIT = "val"  # that trials are judged on
+Key = tuple[str, str]  # line, problem
 PROBLEM = ("backbone", "tasks", "pretrained")  # axes that make a problem of its own, as a recipe
 ONE = ("recipe", "seed", *PROBLEM)  # axes that no line is called by
 
@@ -62,11 +62,16 @@ class Tried:
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The best trial of a line on a problem, by its mean score over the tuning seeds."""
+class Setting:
+    """What a line's trials with one setting on a problem came to, over the tuning seeds."""
 
     trial: Trial  # of the first tuning seed
-    score: float  # -inf: all failed, and trial 0 stands
+    score: float  # mean; -inf where one failed
+    task_scores: Mapping[str, float]  # mean of each; none where one failed
+    seconds: float  # of all together; NaN where one has no numbers
+
+
+Settings = Mapping[Key, Sequence[Setting]]
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ class Final:
     problem: str
     base: Cell  # as the grid has it
     cell: Cell
-    choice: Choice
+    choice: Setting
 
 
 def problems(grid: Grid) -> tuple[str, ...]:
@@ -123,21 +128,26 @@ def tried(
     return tuple(_judged(trial, state, metrics[trial.problem]) for trial, state in found)
 
 
-def chosen(
-    grid: Grid, runs: Path, data: Data | None = None, of: Collection[str] | None = None
-) -> dict[tuple[str, str], Choice]:
-    """(line, problem) -> its best trial, the first of equal ones, where all its trials ended."""
-    groups: dict[tuple[str, str], dict[int, list[Tried]]] = {}
-    for each in tried(grid, runs, data, of):
+def ended(tried: Iterable[Tried]) -> Settings:
+    """By line and problem its settings in order, where all its trials have ended."""
+    groups: dict[Key, dict[int, list[Tried]]] = {}
+    for each in tried:
         numbers = groups.setdefault((each.trial.line, each.trial.problem), {})
         numbers.setdefault(each.trial.number, []).append(each)
-    found = {}
-    for key, numbers in groups.items():
-        means = {n: _mean([each.score for each in several]) for n, several in numbers.items()}
-        if not any(math.isnan(mean) for mean in means.values()):
-            best = max(means, key=lambda n: (means[n], -n))
-            found[key] = Choice(numbers[best][0].trial, means[best])
-    return found
+    found = {key: [_setting(of[n]) for n in sorted(of)] for key, of in groups.items()}
+    return {k: v for k, v in found.items() if not any(math.isnan(each.score) for each in v)}
+
+
+def best(settings: Sequence[Setting]) -> Setting:
+    """The one that is chosen: the first of the best, which is the published one if all failed."""
+    return max(settings, key=lambda each: each.score)
+
+
+def chosen(
+    grid: Grid, runs: Path, data: Data | None = None, of: Collection[str] | None = None
+) -> dict[Key, Setting]:
+    """What each line's trials choose on each problem, where all of them have ended."""
+    return {key: best(several) for key, several in ended(tried(grid, runs, data, of)).items()}
 
 
 @plugins.listed_once()
@@ -295,7 +305,7 @@ def _judged(trial: Trial, state: store.State, metrics: list[Column]) -> Tried:
     if state.row is None or state.word not in ("done", "stale"):
         return Tried(trial, -math.inf if state.word == "failed" else math.nan, {}, 0.0)
     metric, seconds = state.row["metric"], CELLS.seconds(state.row)
-    if not all(_finite(metric.get(column.key)) for column in metrics):
+    if not (metrics and all(_finite(metric.get(column.key)) for column in metrics)):
         return Tried(trial, -math.inf, {}, seconds)
     by_task = {task: _score(metric, metrics, task) for task in {c.task: 0 for c in metrics}}
     return Tried(trial, _mean(list(by_task.values())), by_task, seconds)
@@ -306,6 +316,17 @@ def _score(metric: Mapping[str, float], metrics: list[Column], task: str) -> flo
     values = {column.key: max(metric[column.key], 0.0) for column in own}
     upward = {column.key: column.better > 0 for column in own}
     return log_gain(values, dict.fromkeys(values, 1.0), upward, dict.fromkeys(values, task))
+
+
+def _setting(several: Sequence[Tried]) -> Setting:
+    numbers = all(each.task_scores for each in several)
+    tasks = several[0].task_scores if numbers else {}
+    return Setting(
+        trial=several[0].trial,
+        score=_mean([each.score for each in several]),
+        task_scores={task: fmean(each.task_scores[task] for each in several) for task in tasks},
+        seconds=sum(each.seconds for each in several) if numbers else math.nan,
+    )
 
 
 def _mean(scores: list[float]) -> float:

@@ -33,6 +33,12 @@ def collect(
             "--failures", help="Cells that failed, too; a tuned grid counts them as worst trials."
         ),
     ] = False,
+    stale: Annotated[
+        bool,
+        typer.Option(
+            "--stale", help="Rows that other code made, too; stale here as there, as reports say."
+        ),
+    ] = False,
     pack: Annotated[
         Path | None,
         typer.Option(
@@ -70,6 +76,10 @@ def collect(
     from mtl_bench.bench import collect as collecting
     from mtl_bench.cli.grid import Choice
 
+    of_a_grid = {"--recipe": recipe, "--seeds": seeds, "--smoke": smoke, "--set": settings}
+    for option, value in {**of_a_grid, "--pretrained": pretrained}.items():
+        if value and not grid:
+            raise ValueError(f"{option} goes with --pack FILE.xz --grid NAME: it says which jobs")
     if pack is None:
         if not sources:
             raise ValueError("nothing to collect: name runs folders or packs, or --pack FILE.xz")
@@ -79,7 +89,7 @@ def collect(
         missing = next((source for source in sources if not source.exists()), None)
         if missing is not None:
             raise ValueError(f"no runs folder or pack '{missing}'")
-        taken, left = collecting.collect(sources, runs, weights, failures)
+        taken, left = collecting.collect(sources, runs, weights, failures, stale)
         typer.echo(f"collected {taken} into {runs}")
     else:
         if sources or weights:
@@ -87,7 +97,7 @@ def collect(
             raise ValueError(f"{word} does not go with --pack, which packs what is in --runs")
         choice = Choice(grid, recipe, seeds, smoke, settings, pretrained) if grid else None
         jobs = None if choice is None else choice.needed(runs)
-        packed, left = collecting.pack(pack, runs, jobs, curves, failures)
+        packed, left = collecting.pack(pack, runs, jobs, curves, failures, stale)
         typer.echo(f"packed {packed} of {runs} in {pack}, {pack.stat().st_size / 1024:.0f} KiB")
     for line in collecting.told(left):
         typer.echo(line)

@@ -73,6 +73,7 @@ def synthetic(
 def check(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Root of the data set.")],
     deep: Annotated[bool, typer.Option("--deep", help="Decode every file, too.")] = False,
+    plugins: o.PluginsOption = None,
 ) -> None:
     """Report what a data set holds against what was published, everything that is wrong with it,
     and which recipes it can run; exit code 1 if anything is wrong."""

@@ -109,7 +109,7 @@ def ablate(
     run before them, and the baseline's too, be they in a row or not. A grid of latencies takes them
     one at a time.
     """
-    from mtl_bench.bench import references, store
+    from mtl_bench.bench import references, store, tuning
     from mtl_bench.bench.data_state import Data
     from mtl_bench.bench.jobs import CELLS
     from mtl_bench.bench.slurm import options_of
@@ -131,8 +131,9 @@ def ablate(
             "--on slurm queues cells; latencies are taken on a machine that you choose"
         )
     against = references.baselines(chosen)
-    chosen.kind.check([*chosen.jobs, *against])
-    for job in (*chosen.jobs, *against) if each > 1 else ():
+    tried = [trial.cell for trial in tuning.trials(chosen)] if chosen.tune else []
+    chosen.kind.check([*chosen.jobs, *against, *tried])
+    for job in (*chosen.jobs, *against, *tried) if each > 1 else ():
         check_share(job.recipe.optim, each)
     if chosen.kind is CELLS and not dry_run:  # it imports pandas
         from mtl_bench.report import grid as of_cells
@@ -410,6 +411,7 @@ def _announce(
 ) -> None:
     from mtl_bench.bench import references, store, tuning
     from mtl_bench.bench.jobs import CELLS, with_parents
+    from mtl_bench.bench.space import SPLIT
 
     counts = {axis: len(values) for axis, values in grid.axes.items()}
     counts |= {"row": len(set(grid.names.values()))} if grid.names else {}
@@ -424,7 +426,7 @@ def _announce(
         typer.echo(
             f"{len(grid.jobs)} results = {product}, less {len(grid.skips)} skipped, and their "
             f"baselines; before them {len(tuning.trials(grid))} trials: {grid.tune.trials} of "
-            f"every line on every problem, judged on the split {tuning.SPLIT}; {about}"
+            f"every line on every problem, judged on the split {SPLIT}; {about}"
         )
         _tell_parts(grid, runs, rerun, data)
     else:

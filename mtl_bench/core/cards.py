@@ -11,9 +11,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from mtl_bench.core import plugins
+from mtl_bench.core.declared import arguments_of, declared_in
 from mtl_bench.core.fingerprint import forget_edited
 from mtl_bench.core.plugins import Description
 from mtl_bench.core.text import in_markdown
@@ -40,6 +42,7 @@ class Card:
     extras: tuple[str, ...] = ()  # what it asks for beyond that
     cost: str = ""  # of a step, in the letters of LEGEND
     settings: Mapping[str, str] = field(default_factory=dict)  # name -> default, as Python text
+    space: Mapping[str, Any] = field(default_factory=dict)  # what trials draw
 
 
 def cards() -> list[Card]:
@@ -53,17 +56,18 @@ def _card(about: Description) -> Card:
     if not line:
         return Card(about)
     source = _source(about.doc)
-    published = VENUE.search(source)
+    published, declared = VENUE.search(source), declared_in(line)
     return Card(
         about,
         formula=HEADING.split(ast.get_docstring(line[0]) or "")[0].strip(),
         venue=published[1] if published else "",
         year=published[2] if published else "",
         url=_url(source),
-        needs=str(plugins.declared_in(line).get("needs", "")),
+        needs=str(declared.get("needs", "")),
         extras=tuple(_extras(line)),
         cost=_cost(line),
-        settings={k: argument.text for k, argument in plugins.arguments_of(line).items()},
+        settings={k: argument.text for k, argument in arguments_of(line).items()},
+        space=declared["space"],
     )
 
 
@@ -88,7 +92,7 @@ def _is_a(line: Sequence[ast.ClassDef], base: str) -> bool:
 
 
 def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
-    values = plugins.declared_in(line)
+    values = declared_in(line)
     if values["reevaluates"]:
         yield "the losses after the step"
     if _is_a(line, "LookAheadMethod"):
@@ -103,7 +107,7 @@ def _extras(line: Sequence[ast.ClassDef]) -> Iterator[str]:
 
 def _cost(line: Sequence[ast.ClassDef]) -> str:
     """As `backward` spends it; what the method itself computes is not in it."""
-    values = plugins.declared_in(line)
+    values = declared_in(line)
     if values.get("needs") == "losses":
         return "2F + 1B" if values["reevaluates"] else "1F + 1B"
     if _is_a(line, "PerturbedMethod"):
@@ -212,10 +216,7 @@ def _section(card: Card) -> str:
     notes = [f"Source: <{card.url}>." if card.url else ""]
     notes += [f"Needs {', '.join((card.needs, *card.extras))}." if card.needs else ""]
     notes += [f"Hyper-parameters: {settings}." if settings else ""]
-    known = plugins.attributes_of(card.about.path) if card.needs else {}
-    drawn = ", ".join(
-        _code(f"{key} = {json.dumps(where)}") for key, where in known.get("space", {}).items()
-    )
+    drawn = ", ".join(_code(f"{key} = {json.dumps(where)}") for key, where in card.space.items())
     notes += [f"Trials draw {drawn}." if drawn else ""]
     return f"### {in_markdown(card.about.name)}\n\n{formula}\n{' '.join(filter(None, notes))}\n"
 

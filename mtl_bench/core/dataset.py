@@ -243,8 +243,14 @@ class Dataset:
 
         Args:
             deep: decode every file, too.
+
+        Raises:
+            ValueError: the data set does without.
         """
-        raise NotImplementedError
+        raise ValueError(
+            f"'{root}': the data set '{cls.name}' has no check; `mtl-bench check {cls.name}` tests "
+            "how it reads frames"
+        )
 
     @classmethod
     def image_files(cls, root: Path, split: str) -> dict[str, Path]:

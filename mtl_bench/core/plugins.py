@@ -17,19 +17,19 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
-import itertools
 import os
 import re
 import sys
 import traceback
 import types
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from mtl_bench.core.declared import Argument, arguments_of, assigned_in, declared_in, literal
 from mtl_bench.core.files import content
 from mtl_bench.core.fingerprint import (
     ancestry,
@@ -58,9 +58,6 @@ SHIPPED = {  # in the package; the others have a folder of their own beside it
     "datasets": PACKAGE / "data",
     "engines": PACKAGE / "deploy" / "engines",
 }
-GIVEN = (  # the harness fills these arguments in
-    *("self", "terms", "seed", "strides", "size", "outputs", "pretrained"),
-)
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")  # ASCII, and short: runs' folders are called by it
 ANY = "[!_.]*"  # matches the stems of plug-ins, and not those of what lies beside them
 NAMED = "is no name: a lower-case letter, then at most 63 such letters, digits and _"
@@ -72,8 +69,6 @@ IS_TASK = Rule(
     "a name of a-z, 0-9 and _, or that, a colon and a field of letters, digits and _",
     lambda value: bool(re.fullmatch(rf"{NAME.pattern}(:\w+)?", value, re.ASCII)),
 )
-TOLD = re.compile(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", re.MULTILINE)  # in a section Args
-PLAIN = {"int": int, "float": float, "bool": bool, "str": str}
 
 _listed: ContextVar[dict[tuple[str, str], dict[str, list[Path]]] | None] = ContextVar(
     "listed", default=None
@@ -258,16 +253,24 @@ def declared(kind: str, name: str) -> dict[str, object]:
     return declared_in(lineage(kind, path_of(kind, name)))
 
 
-def declared_in(line: Sequence[ast.ClassDef]) -> dict[str, object]:
-    """Class attributes with a constant value; the nearest class counts."""
-    values: dict[str, object] = {}
-    for node in reversed(line):
-        for item in node.body:
-            if isinstance(item, ast.Assign) and isinstance(item.value, ast.Constant):
-                values |= {ast.unparse(target): item.value.value for target in item.targets}
-            elif isinstance(item, ast.AnnAssign) and isinstance(item.value, ast.Constant):
-                values[ast.unparse(item.target)] = item.value.value
-    return values
+def read_attribute(kind: str, name: str, attribute: str) -> Any:
+    """A class attribute of a plug-in that its contract has, be it a base's, without importing.
+
+    Raises:
+        ValueError: it is not written out; an unknown plug-in, or none of this kind.
+    """
+    path = path_of(kind, name)
+    line = lineage(kind, path)
+    if not line:
+        raise ValueError(f"{path} defines no subclass of {BASES[kind][1]}")
+    *_, written = (value for other, value in assigned_in(reversed(line)) if other == attribute)
+    value = literal(written)
+    if value is ...:
+        raise ValueError(
+            f"{path}: {attribute} = {ast.unparse(written)} cannot be read without running it; "
+            f"write its values out"
+        )
+    return value
 
 
 @functools.cache
@@ -326,21 +329,13 @@ def attributes(kind: str, name: str) -> dict[str, Any]:
     Raises:
         ValueError: an unknown or ambiguous name.
     """
-    return attributes_of(path_of(kind, name))
-
-
-def attributes_of(path: Path) -> dict[str, Any]:
-    """The same of a plug-in's file."""
-    return dict(_attributes(content(path)))
+    return dict(_attributes(content(path_of(kind, name))))
 
 
 @functools.cache
 def _attributes(text: bytes) -> Mapping[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in _assigned(text):
-        with contextlib.suppress(ValueError):  # not a literal
-            found[name] = ast.literal_eval(value)
-    return found
+    values = ((name, literal(value)) for name, value in _assigned(text))
+    return {name: value for name, value in values if value is not ...}
 
 
 def readable(kind: str) -> list[str]:
@@ -364,10 +359,7 @@ def _assigned(text: bytes) -> Iterator[tuple[str, ast.expr]]:
     classes = [node for node in _parse(text).body if isinstance(node, ast.ClassDef)]
     contracts = {base for _, base in BASES.values()}
     own = [c for c in classes if {ast.unparse(b) for b in c.bases} & contracts]
-    for item in itertools.chain.from_iterable(node.body for node in own or classes):
-        targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
-        if isinstance(item, (ast.Assign, ast.AnnAssign)) and item.value is not None:
-            yield from ((ast.unparse(target), item.value) for target in targets if target)
+    yield from assigned_in(own or classes)
 
 
 def bases(kind: str, text: bytes) -> list[str]:
@@ -515,15 +507,6 @@ def _with_helpers(path: Path) -> list[Path]:
     return sorted(found)
 
 
-class Argument(NamedTuple):
-    """An argument of a plug-in's constructor that is its user's to set."""
-
-    kind: Any  # its type, as `plain.convert` takes it; Any where the file says none that is known
-    text: str  # its default, as it is written
-    default: Any  # its value; ... where it is no literal
-    about: str = ""  # what the class's docstring says of it
-
-
 def arguments(kind: str, name: str) -> dict[str, Argument]:
     """Hyper-parameters: the constructor's arguments that the harness leaves alone, by name.
 
@@ -533,63 +516,3 @@ def arguments(kind: str, name: str) -> dict[str, Argument]:
     path = path_of(kind, name)
     forget_edited()
     return arguments_of(lineage(kind, path))
-
-
-def arguments_of(line: Sequence[ast.ClassDef]) -> dict[str, Argument]:
-    """Of a class and its bases, the nearest first: those of the nearest constructor."""
-    items = (item for node in line for item in node.body if isinstance(item, ast.FunctionDef))
-    for item in items:
-        if item.name == "__init__":
-            break
-    else:
-        return {}
-    plain, keywords = [*item.args.posonlyargs, *item.args.args], item.args.kwonlyargs
-    defaults = [*[None] * (len(plain) - len(item.args.defaults)), *item.args.defaults]
-    pairs = zip([*plain, *keywords], [*defaults, *item.args.kw_defaults], strict=True)
-    told = _told(line)
-    return {
-        found.arg: _argument(found.annotation, default)._replace(about=told.get(found.arg, ""))
-        for found, default in pairs
-        if found.arg not in GIVEN
-    }
-
-
-def _told(line: Sequence[ast.ClassDef]) -> dict[str, str]:
-    """Argument -> what the section Args of its class's docstring says; `a, b: ...` is of both."""
-    found: dict[str, str] = {}
-    for node in line:
-        section = (ast.get_docstring(node) or "").partition("\nArgs:\n")[2]
-        for names, text in TOLD.findall(section):
-            found |= {name: " ".join(text.split()) for name in names.split(", ")} | found
-    return found
-
-
-def _argument(annotation: ast.expr | None, written: ast.expr | None) -> Argument:
-    default: Any = ...
-    inner = written
-    if isinstance(written, ast.Call) and ast.unparse(written.func) == "MappingProxyType":
-        inner = written.args[0]
-    with contextlib.suppress(ValueError):  # not a literal
-        default = ... if inner is None else ast.literal_eval(inner)
-    of = type(default) if type(default) in PLAIN.values() else Any
-    kind = of if annotation is None else _type(annotation)
-    return Argument(kind, "" if inner is None else ast.unparse(inner), default)
-
-
-def _type(node: ast.expr) -> Any:
-    """What an annotation stands for; Any where that is no type of plain values."""
-    match node:
-        case ast.Name(id=name):
-            return PLAIN.get(name, Any)
-        case ast.Constant(value=None):
-            return None
-        case ast.BinOp(left=left, op=ast.BitOr(), right=right):
-            sides = _type(left), _type(right)
-            return Any if Any in sides else sides[0] | sides[1]
-        case ast.Subscript(value=ast.Name(id="tuple"), slice=ast.Tuple(elts=inner)):
-            if isinstance(inner[-1], ast.Constant):  # ...
-                return tuple[_type(inner[0]), ...]  # type: ignore[misc]
-            return tuple[tuple(map(_type, inner))]  # type: ignore[misc]
-        case ast.Subscript(value=ast.Name(id="Mapping"), slice=ast.Tuple(elts=[_, value])):
-            return Mapping[str, _type(value)]  # type: ignore[misc]
-    return Any

@@ -13,6 +13,7 @@ import json
 import logging
 import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,8 @@ def export(
             lengths and areas are made for one size.
 
     Raises:
-        ValueError: no such `post`, the package onnx is missing, or a size cannot be free.
+        ValueError: no such `post`, the package onnx is missing, a size cannot be free, or two
+            inputs or outputs of a file have one name.
     """
     if post not in POST:
         raise ValueError(f"--post '{post}' is none of {', '.join(POST)}")
@@ -103,12 +105,17 @@ def export(
         raise ValueError(
             "--dynamic goes with --post none: the post-processing is made for one size, in pixels"
         )
+    if multiple is not None and any(n.backbone.vector for n in maps.networks_of(net)):
+        raise ValueError(
+            f"--dynamic: the backbone gives one vector, and is made for {size[0]}x{size[1]} alone: "
+            "leave it out"
+        )
+    tasks = maps.tasks_of(net)
+    names, results = maps.maps_of(tasks), maps.results_of(tasks)
+    _check_names(post, names, results)
     graph = strided(net, (1, *size), multiple=multiple)
     full = FullSize(graph, size if multiple is None else None)
-    tasks = graph.tasks
-    names = maps.maps_of(tasks)
-    camera = maps.camera_of(tasks, size)
-    finish, results = Post(tasks), maps.results_of(tasks)
+    camera, finish = maps.camera_of(tasks, size), Post(tasks)
     image = {"image": torch.randint(0, 256, (1, *size, 3), dtype=torch.uint8)}
     about = _about(tasks[0].labels, size, post) | (metadata or {})
     if multiple is not None:
@@ -144,6 +151,23 @@ def ports(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
 
     graph = onnx.load(str(path)).graph
     return {"inputs": of(graph.input), "outputs": of(graph.output)}
+
+
+def _check_names(post: str, names: Sequence[str], results: Sequence[str]) -> None:
+    """Each input and output of a file has a name of its own: the maps, or the tasks' results."""
+    files = {"inside": [results], "none": [names], "apart": [names, results]}[post]
+    for name, count in (pair for outputs in files for pair in Counter(outputs).items()):
+        if count > 1:
+            raise ValueError(
+                f"two outputs of the file are called '{name}': leave out one of the tasks that "
+                "give it, --tasks NAME,NAME"
+            )
+    both = [name for name in names if name in results]
+    if post == "apart" and both:
+        raise ValueError(
+            f"--post apart: '{both[0]}' would be an input and an output of the second file: "
+            "choose --post inside or none"
+        )
 
 
 def _described(

@@ -39,7 +39,7 @@ class Comparison:
     """A line against the control, over the blocks that both have."""
 
     difference: Estimate  # at LEVEL, points
-    ahead: bool  # the mean difference, failed runs clipped, is above 0
+    ahead: bool  # the mean difference, as the test sees it, is above 0
     within: bool  # the 90 % interval lies inside the margin
     superior: float  # share of blocks in which the line is ahead, ties half
     p: float  # two-sided
@@ -137,25 +137,29 @@ def compare(
 ) -> list[Comparison]:
     """Every line against one control; the lines are the family of Holm's correction.
 
+    What is tested is what is printed, the mean over problems of the mean over seeds: where runs are
+    missing, a block of a problem with fewer of them weighs more.
+
     Args:
         score_LMN: the control is none of them.
-        test: two-sided p of the differences by block; None: `sign_flip`.
+        test: two-sided p of what each block adds to the mean; None: `sign_flip`.
         margin: of equivalence, in points of the score.
     """
     found = []
     for line_MN in score_LMN:
         d_MN = difference(line_MN, control_MN)
-        d_B = d_MN[~np.isnan(d_MN)]
+        known_MN = ~np.isnan(d_MN)
+        d_B, part_B = d_MN[known_MN], (d_MN * _weights(known_MN))[known_MN]
         # a tie of two failed runs is no sign that the lines are alike
-        apart_MN = np.where(np.isneginf(line_MN) & ~np.isnan(d_MN), -np.inf, d_MN)
+        apart_MN = np.where(np.isneginf(line_MN) & known_MN, -np.inf, d_MN)
         narrow = stratified_t(apart_MN, 0.9)
         found.append(
             Comparison(
                 difference=stratified_t(apart_MN),
-                ahead=bool(clipped(d_B).sum() > 0),
+                ahead=bool(clipped(part_B).sum() > 0),
                 within=-margin < narrow.low and narrow.high < margin,
                 superior=superiority(d_B),
-                p=(test or sign_flip)(d_B),
+                p=(test or sign_flip)(part_B),
                 p_holm=np.nan,
                 blocks=len(d_B),
                 failed=int(np.isinf(apart_MN).sum()),
@@ -163,6 +167,13 @@ def compare(
         )
     corrected = holm([each.p for each in found])
     return [replace(each, p_holm=p) for each, p in zip(found, corrected, strict=True)]
+
+
+def _weights(known_MN: NDArray[np.bool_]) -> Array:
+    """Of a problem's blocks: 1 where it has as many as any, more where it has fewer."""
+    count_M1 = known_MN.sum(1, keepdims=True)
+    found: Array = count_M1.max() / np.maximum(count_M1, 1)
+    return found
 
 
 def ahead(value_LN: Array, control_N: Array) -> list[bool]:
@@ -275,12 +286,17 @@ def ranks(score_XL: Array) -> Array:
     return np.asarray(stats.rankdata(-score_XL, axis=-1, nan_policy="omit"), float)
 
 
-def suite_mean(score_XMN: Array) -> Array:
-    """Mean over problems of the mean over seeds; NaN for a line that lacks a problem."""
+def seed_mean(score_XMN: Array) -> Array:
+    """Mean over seeds; NaN for a problem without runs."""
     known = ~np.isnan(score_XMN)
     with np.errstate(invalid="ignore"):
-        mean_XM = np.where(known, score_XMN, 0).sum(-1) / known.sum(-1)
-    found: Array = mean_XM.mean(-1)
+        found: Array = np.where(known, score_XMN, 0).sum(-1) / known.sum(-1)
+    return found
+
+
+def suite_mean(score_XMN: Array) -> Array:
+    """Mean over problems of the mean over seeds; NaN for a line that lacks a problem."""
+    found: Array = seed_mean(score_XMN).mean(-1)
     return found
 
 
@@ -290,18 +306,23 @@ def rank_bands(
     """Best and worst rank of each line, [L, 2]: over choices that a report makes, and over seeds.
 
     The choices are how a score is defined and which problem is left out. Of the ranks under
-    resampled seeds, drawn jointly for all lines, the band is the middle LEVEL.
+    resampled seeds, drawn jointly for all lines, the band is the middle LEVEL. A rank depends on
+    the lines that are ranked: they are the same throughout, those that have every problem. One
+    that has no run of a problem among the drawn seeds counts there with its mean over all.
 
     Args:
         definitions: scores of the same runs, [L, M, N] each; the first is resampled.
     """
     problems = definitions[0].shape[1]
+    lacks_L = np.isnan(suite_mean(definitions[0]))
+    definitions = [np.where(lacks_L[:, None, None], np.nan, s) for s in definitions]
     chosen = [suite_mean(score_LMN) for score_LMN in definitions]
     if problems > 1:
         left_out = (np.delete(s, m, axis=1) for s in definitions for m in range(problems))
         chosen += [suite_mean(score_LMN) for score_LMN in left_out]
-    drawn = resampled(definitions[0], resamples, seed)
-    drawn_SL = np.concatenate([suite_mean(score_SLMN) for score_SLMN in drawn])
+    own_LM = seed_mean(definitions[0])
+    drawn = map(seed_mean, resampled(definitions[0], resamples, seed))
+    drawn_SL = np.concatenate([np.where(np.isnan(m), own_LM, m).mean(-1) for m in drawn])
     tails = [50 * (1 - LEVEL), 50 * (1 + LEVEL)]
     return (
         _ends(ranks(np.stack(chosen)), [0, 100]),

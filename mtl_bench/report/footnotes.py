@@ -26,9 +26,10 @@ def footnotes(results: "Results") -> Iterator[str]:
         )
     elif any(len(group.rows) > 1 for group in groups):
         floor = ", and of the trivial predictor by more than its own" if results.baseline else ""
+        where = f" in {results.problem}, where nothing is tested" if results.problem else ""
         yield (
-            "Mean +- sample standard deviation over n seeds. Bold: ahead of every other plain line "
-            f"by more than either's spread{floor}."
+            f"Mean +- sample standard deviation over n seeds. Bold{where}: ahead of every other "
+            f"plain line by more than either's spread{floor}."
         )
     if any(len(group.rows) == 1 for group in [g for g in groups if not g.mark] or groups):
         yield (
@@ -64,10 +65,12 @@ def _delta(results: "Results") -> Iterator[str]:
     named = joint.join(_named([c for c in metrics if c.task == task]) for task in tasks)
     of = f" of {results.problem}" if results.problem else ""
     over = f"Delta{of}: over {named}, relative to the baseline ({against}) of the same seed."
+    # of a suite it is said once, whatever a problem's metrics are
+    counts = [" " + _count(things) for things in (metrics, tasks)] if not of else ["", ""]
     defined = (
-        f"Flat: mean relative loss over the {_count(metrics)} metrics, so that "
+        f"Flat: mean relative loss over the{counts[0]} metrics, so that "
         "less is better and a negative one is a gain. Task: mean relative gain, first over a "
-        f"task's metrics and then over the {_count(tasks)} tasks, so that more is better. "
+        f"task's metrics and then over the{counts[1]} tasks, so that more is better. "
         "Log gain: likewise, of the ratios' logarithms, so that a halved and a doubled error weigh "
         "the same. The baseline's own is 0 by definition and not shown"
     )

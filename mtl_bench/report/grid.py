@@ -10,29 +10,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from markupsafe import Markup
 
+from mtl_bench.bench import tuning
 from mtl_bench.bench.tuning import Tried
 from mtl_bench.core import quality
 from mtl_bench.core.columns import FPS, Column
 from mtl_bench.core.config import to_dict
 from mtl_bench.core.plain import did_you_mean, from_dict
-from mtl_bench.core.style import MANY
 from mtl_bench.report import columns as known
-from mtl_bench.report import curves, pictures, plots, protocol, trials, tuned, verdict_plots
+from mtl_bench.report import figures, protocol, trials, tuned
 from mtl_bench.report.columns import (
     ONLY,
     RELATIVE,
     Row,
     capital,
     headlines,
-    pairs,
-    per_class,
     text,
 )
 from mtl_bench.report.footnotes import footnotes
-from mtl_bench.report.page import PAGE, Figure, Page, beside, figures_of, render
+from mtl_bench.report.page import PAGE, Figure, Page, beside, render
 from mtl_bench.report.statistics import (
     SHOWN,
     SMOKE,
@@ -41,7 +38,6 @@ from mtl_bench.report.statistics import (
     by_recipe,
     cell_of,
     grouped,
-    kept,
     tested,
     trivial_group,
 )
@@ -61,12 +57,11 @@ from mtl_bench.report.table import (
     write,
 )
 from mtl_bench.report.verdicts import Verdicts, judge, notes, records, sections, untested
-from mtl_bench.train.curve import read as read_curve
 
 PUBLISHED = Path(__file__).parent / "literature.toml"
 AXES = {"recipe.name": "recipe", "name": "configuration", "single_task": "single-task"}
 VERDICTS, TRIALS = "verdicts", "trials"  # stems of their files
-WIDE = ("loss_curves", "weight_curves", "diagnostics", "classes", "samples", "extremes")
+ALIKE = 5  # cells that lack numbers for one reason and still have a line each
 TRAINED_BRIEFLY = "Cells marked smoke were trained for a few steps to show that the pipeline works."
 
 
@@ -275,10 +270,13 @@ def fill(results: Results, short: bool = False) -> Table:
     main = [c for c in results.columns() if c.short or c.headline]
     banner = f"{SMOKE.capitalize()}." if results.smoke else ""
     said = {"Quality": f" {' '.join(notes)}"}
-    lacking = [TableRow.of(c.label, c.status, c.reason, c.slug) for c in results.unfinished]
+    of = f"{results.problem}: " * bool(results.problem)
+    alike: dict[tuple[str, str], list[Unfinished]] = {}
+    for cell in results.unfinished:
+        alike.setdefault((cell.status, cell.reason), []).append(cell)
+    lacking = [line for cells in alike.values() for line in _without_numbers(of, cells)]
     why = Head("why", left=True, css=WRAP), Head("folder", left=True, page_only=True)
     heads = (*Head.words("cell", "status"), *why)
-    of = f"{results.problem}: " * bool(results.problem)
     return Table(
         sections=tuple(
             _section(
@@ -295,6 +293,15 @@ def fill(results: Results, short: bool = False) -> Table:
         published=tuple(_published(source, results.axes[0]) for source in results.published),
         banner=banner,
     )
+
+
+def _without_numbers(of: str, alike: Sequence[Unfinished]) -> list[TableRow]:
+    """A line each of cells with the same status and reason, one line of very many."""
+    first, last = alike[0], alike[-1]
+    if len(alike) <= ALIKE:
+        return [TableRow.of(of + c.label, c.status, c.reason, c.slug) for c in alike]
+    named = f"{of}{len(alike)} cells, {first.label} to {last.label}"
+    return [TableRow.of(named, first.status, first.reason, "")]
 
 
 def together(tables: Sequence[Table]) -> Table:
@@ -423,10 +430,10 @@ def build(
     ]
     judged = judge(rows, layout.rows, layout.control) if layout.control is not None else None
     with beside(out_dir, (*known.figures(), VERDICTS, TRIALS)) as folder:
-        figures = [] if judged is None else _figures_of_verdicts(judged, tried, folder)
+        drawn = [] if judged is None else figures.of_verdicts(judged, tried, folder)
         for results in () if layout.only else problems:
-            figures += _figures_of(results, folder, runs_root)
-        _write(grid, rows, problems, judged, tried, figures, folder, command)
+            drawn += figures.of_problem(results, folder, runs_root)
+        _write(grid, rows, problems, judged, tried, drawn, folder, command)
     return out_dir / PAGE
 
 
@@ -436,7 +443,7 @@ def _write(
     problems: Sequence[Results],
     judged: Verdicts | None,
     tried: Sequence[Tried],
-    figures: Sequence[Figure],
+    drawn: Sequence[Figure],
     folder: Path,
     command: str,
 ) -> None:
@@ -447,11 +454,13 @@ def _write(
     more = {f"{TRIALS}.csv": trials.records(tried)} if tried else {}
     if judged is not None:
         first, said = sections(judged, tune), tuple(notes(judged))
-        behind = trials.distances(judged, trials.ended(tried))
+        behind = trials.distances(judged, tuning.ended(tried))
         first += [] if behind is None else [behind]
         table = replace(table, sections=(*first, *table.sections), notes=(*said, *table.notes))
-        rest = brief.sections if len(problems) == 1 else ()  # those of many problems: on the page
-        brief = replace(brief, sections=(*first, *rest), notes=(*said, *brief.notes))
+        if len(problems) == 1:
+            brief = replace(brief, sections=(*first, *brief.sections), notes=(*said, *brief.notes))
+        else:  # the verdicts; each problem's numbers are on the page
+            brief = replace(brief, sections=tuple(first[:1]), notes=said)
         more[f"{VERDICTS}.csv"] = records(judged)
     elif control is not None:
         lines = [", ".join(group.identity) for group in groups]
@@ -470,7 +479,7 @@ def _write(
         banner=f"{table.banner} {TRAINED_BRIEFLY}" if table.banner else "",
         lacking="Cells without numbers",
         nothing="No cell of this grid has numbers yet.",
-        figures=figures,
+        figures=drawn,
         protocol=protocol.of_cells([row for group in groups for row in group.rows]),
         of="cells",
         files=tuple(more),
@@ -479,42 +488,6 @@ def _write(
     )
     more |= {"readme.md": markdown(brief), PAGE: render(page, table, folder)}
     write(table, folder, more)
-
-
-def _figures_of_verdicts(judged: Verdicts, tried: Sequence[Tried], folder: Path) -> list[Figure]:
-    """Those of all problems together, and of trials each problem's trade-off."""
-    settings = trials.ended(tried)
-    drawn = {
-        "forest": verdict_plots.forest(judged, folder, "forest"),
-        "bands": verdict_plots.bands(judged, folder, "bands"),
-        "profiles": verdict_plots.profiles(judged, folder, "profiles"),
-        "budgets": trials.budgets(judged, settings, folder, "budgets"),
-    }
-    wide = len(judged.problems) > 1 or len(judged.lines) > MANY
-    found = [replace(figure, wide=wide) for figure in figures_of(known.figures(), drawn)]
-    for problem in judged.problems:
-        stem = f"{problem.replace(', ', '-')}-tradeoff" if len(judged.problems) > 1 else "tradeoff"
-        caption = trials.tradeoff(judged, settings, problem, folder, stem)
-        if caption is not None:
-            heading = ": ".join(filter(None, (problem, known.figures()["tradeoff"].lower())))
-            found.append(Figure(stem, capital(heading), caption, wide=True))
-    return found
-
-
-def _figures_of(results: Results, folder: Path, runs_root: Path | None) -> list[Figure]:
-    """Those of one problem, under its name where it is one of several."""
-    of, headings = results.problem, known.figures()
-    where = folder / of
-    where.mkdir(exist_ok=True)
-    captions = _draw(results, where, runs_root)
-    wide = headings if len(results.groups) > MANY else WIDE
-    found = [replace(f, wide=f.name in wide) for f in figures_of(headings, captions)]
-    if not of:
-        return found
-    for path in sorted(where.iterdir()):
-        path.replace(folder / f"{of}-{path.name}")
-    where.rmdir()
-    return [replace(f, name=f"{of}-{f.name}", heading=f"{of}: {f.heading}") for f in found]
 
 
 def _skipped(grid: Any) -> list[Row]:
@@ -531,31 +504,6 @@ def _skipped(grid: Any) -> list[Row]:
         }
         for skip in getattr(grid, "skips", ())
     ]
-
-
-def _draw(results: Results, out_dir: Path, runs_root: Path | None) -> dict[str, str | None]:
-    """Draw all that can be drawn; what each figure shows, by its stem."""
-    captions = {f"{y.name}_{x.name}": plots.against(results, y, x, out_dir) for y, x in pairs()}
-    captions |= {
-        stem: plots.classes(results, column, out_dir, stem) for stem, column in per_class().items()
-    }
-    if runs_root is not None:
-        runs = {
-            group.label: frames
-            for group in results.groups
-            if (frames := list(kept(group, runs_root, "curve.csv", _curve)))
-        }
-        captions["loss_curves"] = curves.terms(results, runs, "loss", out_dir)
-        captions["weight_curves"] = curves.terms(results, runs, "weight", out_dir)
-        captions["diagnostics"] = curves.diagnostics(results, runs, out_dir)
-        captions["samples"] = pictures.draw(results, runs_root, out_dir)
-        captions["extremes"] = pictures.extremes(results, runs_root, out_dir)
-    return captions
-
-
-def _curve(path: Path) -> pd.DataFrame:
-    found: pd.DataFrame = pd.DataFrame(read_curve(path)).apply(pd.to_numeric)
-    return found
 
 
 def counted_images(results: Results) -> Section | None:

@@ -54,10 +54,12 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         axes = figure.add_subplot()
         handles: list[Any] = []
         spots = {}
+        outside = _zoom(axes, groups, x, y) if many else []
         for index, (group, look) in enumerate(looks_of(results), 1):
             if group in groups:
                 spots[index] = (group.entries[x.name].mean, group.entries[y.name].mean)
-                _point(axes, group, x, y, look, 0.35 if many else 1.0)
+                if group not in outside:
+                    _point(axes, group, x, y, look, 0.35 if many else 1.0)
                 label = f"{index} " * many + f"{group.label} (n={len(group.rows)})"
                 handles.append(Line2D([], [], linestyle="", label=label, **_marker(group, look)))
         if x == FPS and results.baseline and results.baseline.entries[y.name].count:
@@ -66,10 +68,11 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         where = f"\n{_where_timed(groups)}" if x == FPS else ""
         axes.set_xlabel(f"{with_unit(x)} ({better(x)} is better){where}")
         axes.set_ylabel(f"{with_unit(y)}\n({better(y)} is better)")
-        axes.margins(0.12)
-        outside = _zoom(axes, groups, x, y) if many else []
-        spots = {i: s for i, s in spots.items() if results.groups[i - 1] not in outside}
+        if not many:
+            axes.margins(0.12)
+        # those out of view are on the front, too, or beyond it
         plain = [spots[i] for i in spots if not results.groups[i - 1].mark] or [*spots.values()]
+        spots = {i: s for i, s in spots.items() if results.groups[i - 1] not in outside}
         if len(plain) > 1:
             draw_front(axes, plain, (x.better, y.better))
             handles.append(Line2D([], [], label="Pareto front", **FRONT))
@@ -81,12 +84,14 @@ def against(results: "Results", y: Column, x: Column, out_dir: Path) -> str | No
         if many:
             _number(axes, spots)
         save(figure, out_dir, f"{y.name}_{x.name}")
+    spread = any(g.entries[c.name].count > 1 for g in groups for c in (x, y))
+    bars = " Bars: the sample standard deviation over seeds." * spread
     if many:
         far = [f"{g.label} {_short(g, y)} at {_short(g, x)}" for g in outside]
         more = f" Further out: {'; '.join(far)}." if far else ""
-        return f"{y.title} against {x.title}; the numbers are those of the legend.{more}"
+        return f"{y.title} against {x.title}; the numbers are those of the legend.{bars}{more}"
     points = "; ".join(f"{g.label} {_short(g, y)} at {_short(g, x)} {x.title}" for g in groups)
-    return f"{y.title} against {x.title}. {points}."
+    return f"{y.title} against {x.title}. {points}.{bars}"
 
 
 def classes(results: "Results", column: Column, out_dir: Path, name: str) -> str | None:
@@ -186,13 +191,14 @@ def _point(
 
 
 def _zoom(axes: Axes, groups: Sequence[Group], x: Column, y: Column) -> list[Group]:
-    """Show the range of most groups; those outside it."""
+    """Show the range of most groups; those that are out of view."""
     means = np.array([[group.entries[c.name].mean for c in (x, y)] for group in groups])
     (left, right), (low, high) = (middle(several, several) for several in means.T)
     across, up = 0.12 * (right - left) or 1.0, 0.12 * (high - low) or 1.0
-    axes.set_xlim(left - across, right + across)
-    axes.set_ylim(low - up, high + up)
-    shown = np.all((means >= (left, low)) & (means <= (right, high)), axis=1)
+    first, last = (left - across, low - up), (right + across, high + up)
+    axes.set_xlim(first[0], last[0])
+    axes.set_ylim(first[1], last[1])
+    shown = np.all((means >= first) & (means <= last), axis=1)
     return [group for group, inside in zip(groups, shown, strict=True) if not inside]
 
 

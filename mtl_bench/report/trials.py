@@ -9,8 +9,7 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy import stats
 
-from mtl_bench.bench.tuning import SPLIT, Tried
+from mtl_bench.bench.space import SPLIT
+from mtl_bench.bench.tuning import Key, Setting, Settings, Tried, best
 from mtl_bench.core.style import save, styled
 from mtl_bench.report import evidence
 from mtl_bench.report.evidence import Array
@@ -37,29 +37,6 @@ from mtl_bench.report.verdict_plots import (
 from mtl_bench.report.verdicts import Verdicts
 
 PAIRS = 3  # of tasks, where there are more than two
-Key = tuple[str, str]  # line, problem
-
-
-@dataclass(frozen=True)
-class Setting:
-    """The trials of one setting of a line on a problem, over the tuning seeds."""
-
-    score: float  # mean; -inf where one failed
-    tasks: Mapping[str, float]  # mean score of each; none where one failed
-    seconds: float  # of all together; NaN where one has no numbers
-
-
-Settings = Mapping[Key, tuple[Setting, ...]]
-
-
-def ended(tried: Sequence[Tried]) -> Settings:
-    """By line and problem the settings in order, where all of them have ended."""
-    found: dict[Key, dict[int, list[Tried]]] = {}
-    for each in tried:
-        of = found.setdefault((each.trial.line, each.trial.problem), {})
-        of.setdefault(each.trial.number, []).append(each)
-    every = {key: tuple(_setting(of[n]) for n in sorted(of)) for key, of in found.items()}
-    return {k: v for k, v in every.items() if not any(math.isnan(each.score) for each in v)}
 
 
 def budgets(found: Verdicts, settings: Settings, out_dir: Path, name: str) -> str | None:
@@ -116,18 +93,20 @@ def tradeoff(
         What the figure shows in words, or None for fewer than two tasks or two trials with numbers.
     """
     control = found.control.label
-    front, best = _front((control, problem), settings), _best((control, problem), settings)
-    if best is None or len(best.tasks) < 2 or len(front) < 2:
+    front, base = _front((control, problem), settings), _best((control, problem), settings)
+    if base is None or len(base.task_scores) < 2 or len(front) < 2:
         return None
-    tasks = list(best.tasks)
+    tasks = list(base.task_scores)
     points = {
-        label: (_differences(own, best), look)
+        label: (_differences(own, base), look)
         for label, look in highlighted(found)
-        if (own := _best((label, problem), settings)) is not None and own.tasks
+        if (own := _best((label, problem), settings)) is not None and own.task_scores
     }
-    every = [s for (_, p), several in settings.items() if p == problem for s in several if s.tasks]
-    pairs = _pairs(tasks, np.array([_differences(each, best) for each in every]))
-    front_FK = np.array([_differences(each, best) for each in front])
+    every = [s for (_, p), several in settings.items() if p == problem for s in several]
+    pairs = _pairs(
+        tasks, np.array([_differences(each, base) for each in every if each.task_scores])
+    )
+    front_FK = np.array([_differences(each, base) for each in front])
     with styled():
         size = (2.0 + 3.2 * len(pairs), 3.6) if len(pairs) > 1 else (6.8, 4.0)
         figure = Figure(figsize=size, layout="constrained")
@@ -156,7 +135,7 @@ def distances(found: Verdicts, settings: Settings) -> Section | None:
     the control has no front."""
     control = found.control.label
     fronts = {p: _front((control, p), settings) for p in found.problems}
-    problems = [p for p, front in fronts.items() if len(front) > 1 and len(front[0].tasks) > 1]
+    problems = [p for p, f in fronts.items() if len(f) > 1 and len(f[0].task_scores) > 1]
     if not problems:
         return None
     lines = []
@@ -204,21 +183,10 @@ def records(tried: Sequence[Tried]) -> str:
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _setting(several: Sequence[Tried]) -> Setting:
-    scores = [each.score for each in several]
-    numbers = all(each.task_scores for each in several)
-    tasks = several[0].task_scores if numbers else {}
-    return Setting(
-        score=-math.inf if -math.inf in scores else float(np.mean(scores)),
-        tasks={t: float(np.mean([each.task_scores[t] for each in several])) for t in tasks},
-        seconds=sum(each.seconds for each in several) if numbers else math.nan,
-    )
-
-
 def _best(key: Key, settings: Settings) -> Setting | None:
-    """The chosen one: the first of the best; None where trials have not ended, or all failed."""
-    known = [each for each in settings.get(key, ()) if math.isfinite(each.score)]
-    return max(known, key=lambda each: each.score) if known else None
+    """The chosen one; None where trials have not ended, or all failed."""
+    found = best(settings[key]) if key in settings else None
+    return found if found is not None and math.isfinite(found.score) else None
 
 
 def _front(key: Key, settings: Settings) -> list[Setting]:
@@ -246,15 +214,15 @@ def _curve(
 
 
 def _differences(of: Setting, base: Setting) -> Array:
-    return np.array([of.tasks[task] - base.tasks[task] for task in base.tasks])
+    return np.array([of.task_scores[task] - base.task_scores[task] for task in base.task_scores])
 
 
 def _behind(point: Setting | None, front: Sequence[Setting]) -> float:
-    if point is None or not point.tasks:
+    if point is None or not point.task_scores:
         return math.nan
-    tasks = list(point.tasks)
-    front_FK = np.array([[each.tasks[task] for task in tasks] for each in front])
-    return evidence.behind_front(np.array([point.tasks[task] for task in tasks]), front_FK)
+    tasks = list(point.task_scores)
+    front_FK = np.array([[each.task_scores[task] for task in tasks] for each in front])
+    return evidence.behind_front(np.array([point.task_scores[task] for task in tasks]), front_FK)
 
 
 def _pairs(tasks: Sequence[str], score_TK: Array) -> list[tuple[int, int]]:

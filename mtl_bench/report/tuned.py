@@ -3,12 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from mtl_bench.bench.space import SPLIT, Tune
 from mtl_bench.core.text import in_a_line
 from mtl_bench.report.columns import Row, text
 from mtl_bench.report.table import Head, Section, TableRow
 
 
-def section(rows: Sequence[Row], tune: Any) -> Section:
+def section(rows: Sequence[Row], tune: Tune) -> Section:
     """A line for each line and problem: the trial, and what it set.
 
     Args:
@@ -30,14 +31,14 @@ def section(rows: Sequence[Row], tune: Any) -> Section:
     )
 
 
-def note(tune: Any) -> str:
+def note(tune: Tune) -> str:
     """What was tried, and by what was chosen, in three sentences."""
     space = "; ".join(f"{key} {_where(where)}" for key, where in tune.space.items())
     seeds = ", ".join(map(str, tune.seeds))
     return (
         f"Every line, the baseline too, was tuned on every problem by {tune.trials} trials: the "
         f"published setting (trial 0) and quasi-random draws of {space}; and of what its method "
-        f"declares. The best mean log of the metrics on the split val was chosen, at the last "
+        f"declares. The best mean log of the metrics on the split {SPLIT} was chosen, at the last "
         f"step, with seed{'s' * (len(tune.seeds) > 1)} {seeds}; a failed trial counts as the "
         "worst. The reported split was read by the results alone, with other seeds."
     )

@@ -3,6 +3,7 @@
 Colour is the verdict; in the profiles, the line.
 """
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,16 @@ from matplotlib.lines import Line2D
 
 from mtl_bench.core.style import BASELINE, GRAY, PALETTE, Look, looks, save, styled
 from mtl_bench.report import evidence
-from mtl_bench.report.evidence import Comparison
+from mtl_bench.report.evidence import Array, Comparison
 from mtl_bench.report.plots import middle
 from mtl_bench.report.statistics import SMOKE
-from mtl_bench.report.table import PLUS_MINUS
-from mtl_bench.report.verdicts import ALL, VERDICTS, Verdicts, sentence
+from mtl_bench.report.table import FEWER, PLUS_MINUS
+from mtl_bench.report.verdicts import ALL, VERDICTS, Verdicts, has_fewer, sentence
 
 COLORS = dict(zip(VERDICTS, (PALETTE[2], PALETTE[1], PALETTE[0], GRAY), strict=True))
 PANELS = 6  # problems that fit beside each other
 LEADERS = 7  # lines that have a colour where there are many
+ACROSS = 4  # entries of a legend that fit beside each other
 ROW = 0.2  # inches
 FAINT = "#c8c8c8"
 
@@ -40,7 +42,7 @@ def forest(found: Verdicts, out_dir: Path, name: str) -> str | None:
         panels = dict(zip(found.problems, map(list, each), strict=True)) | panels
     if not any(np.isfinite(c.difference.mean) for several in panels.values() for c in several):
         return None
-    labels = [line.label for line in found.lines]
+    labels = [line.label + FEWER * has_fewer(line, found) for line in found.lines]
     one = len(panels) == 1
     with styled():
         width = 7.2 if one else 1.8 + 1.55 * len(panels)
@@ -56,10 +58,13 @@ def forest(found: Verdicts, out_dir: Path, name: str) -> str | None:
         warn(figure, found)
         save(figure, out_dir, name)
     own = "" if one else " Each panel has its own scale."
+    shown = [c.difference for several in panels.values() for c in several]
+    single = any(np.isfinite(d.mean) and np.isnan(d.low) for d in shown)
+    hollow = " Hollow: a single run of a problem, so that no interval is known." * single
     return (
         f"Paired differences to {found.control.label} with 95 % intervals, more is better; gray: "
-        f"the margin of equivalence, {PLUS_MINUS}{evidence.MARGIN:g} point; an arrow: further out."
-        f"{own} {sentence(found)}"
+        f"the margin of equivalence, {PLUS_MINUS}{evidence.MARGIN:g} point; an arrow: it goes on "
+        f"further out; a number: the mean, where that is out, too.{hollow}{own} {sentence(found)}"
     )
 
 
@@ -73,7 +78,8 @@ def profiles(found: Verdicts, out_dir: Path, name: str) -> str | None:
     finite = of.gain_LMN[np.isfinite(of.gain_LMN)]
     if not len(finite):
         return None
-    tau_T = np.unique(np.clip(finite, *middle(finite, finite, evidence.MARGIN)))
+    ends = middle(finite, finite, evidence.MARGIN)
+    tau_T = np.unique(np.clip(finite, *ends))
     with styled():
         figure = Figure(figsize=(8.4, 4.2), layout="constrained")
         axes = figure.add_subplot()
@@ -89,7 +95,8 @@ def profiles(found: Verdicts, out_dir: Path, name: str) -> str | None:
         save(figure, out_dir, name)
     return (
         f"Performance profiles: share of a line's runs ({_suite(found)}) whose gain is above a "
-        f"threshold; higher is better, and a failed run is above none.{said_of_colors(found)}"
+        f"threshold; higher is better, and a failed run is above none.{_out_of_view(finite, ends)}"
+        f"{said_of_colors(found)}"
     )
 
 
@@ -103,7 +110,7 @@ def bands(found: Verdicts, out_dir: Path, name: str) -> str | None:
     if len(ranked) < 2:
         return None
     with styled():
-        figure = Figure(figsize=(7.2, 1.3 + ROW * max(len(ranked), 4)), layout="constrained")
+        figure = Figure(figsize=(7.2, 1.5 + ROW * max(len(ranked), 4)), layout="constrained")
         axes = figure.add_subplot()
         for place, line in enumerate(ranked):
             is_control = line is found.control
@@ -127,10 +134,16 @@ def bands(found: Verdicts, out_dir: Path, name: str) -> str | None:
         warn(figure, found)
         save(figure, out_dir, name)
     left_out = " and with each problem left out" if len(found.problems) > 1 else ""
+    without = len(found.lines) + 1 - len(ranked)
+    absent = (
+        f" Absent: {without} line{'s' * (without > 1)} without a run of some problem."
+        if without
+        else ""
+    )
     return (
-        "Ranks by mean gain (point), their range by definition of the delta (log gain, flat, by "
-        f"task){left_out} (line), and the middle 95 % over seeds resampled jointly for all lines "
-        "(bar)."
+        "Ranks by mean gain (point; diamond: the control), their range by definition of the delta "
+        f"(log gain, flat, by task){left_out} (line), and the middle 95 % over seeds resampled "
+        f"jointly for all lines (bar). Colour: the verdict.{absent}"
     )
 
 
@@ -220,16 +233,20 @@ def _intervals(axes: Axes, compared: Sequence[Comparison]) -> None:
     for place, each in enumerate(compared):
         of, color = each.difference, COLORS[each.verdict]
         if np.isfinite(of.mean):
-            axes.plot([of.low, of.high], [place, place], color=color, linewidth=2)
-            out = of.mean < left or of.mean > right
-            marker = "o" if not out else "<" if of.mean < left else ">"
-            at = float(np.clip(of.mean, left, right))
-            axes.plot(at, place, marker, color=color, markersize=4.5, clip_on=False)
-            if out:
-                side = "left" if of.mean < left else "right"
-                inside = at + room if side == "left" else at - room
+            low, mean, high = np.clip([of.low, of.mean, of.high], left, right)
+            style: dict[str, Any] = {"color": color, "markersize": 4.5, "clip_on": False}
+            axes.plot([low, high], [place, place], color=color, linewidth=2)
+            if np.fmin(of.low, of.mean) < left:
+                axes.plot(left, place, "<", **style)
+            if np.fmax(of.high, of.mean) > right:
+                axes.plot(right, place, ">", **style)
+            if mean == of.mean:
+                face = "white" if np.isnan(of.low) else color
+                axes.plot(mean, place, "o", markerfacecolor=face, **style)
+            else:
+                at, side = (mean + room, "left") if of.mean < left else (mean - room, "right")
                 said = f"{of.mean:+.0f}"
-                axes.text(inside, place, said, ha=side, va="center", fontsize=7, color=color)
+                axes.text(at, place, said, ha=side, va="center", fontsize=7, color=color)
         elif each.failed:
             said = f"{each.failed} failed"
             axes.text(left, place, said, va="center", fontsize=7, color=COLORS["worse"])
@@ -245,7 +262,15 @@ def _verdict_legend(
         if word in given
     ]
     handles += more
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
+    across = len(handles) if len(handles) <= ACROSS else math.ceil(len(handles) / 2)
+    figure.legend(handles=handles, loc="outside upper center", ncols=across)
+
+
+def _out_of_view(values: Array, ends: tuple[float, float]) -> str:
+    """How many runs have a gain beyond the ends of the axis."""
+    below, above = int(np.sum(values < ends[0])), int(np.sum(values > ends[1]))
+    said = " and ".join(f"{n} {where}" for n, where in ((below, "below"), (above, "above")) if n)
+    return f" Out of view: {said} of {len(values)} runs." if said else ""
 
 
 def warn(figure: Figure, found: Verdicts) -> None:

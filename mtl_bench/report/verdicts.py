@@ -7,20 +7,28 @@ as the worst, a missing one leaves its block out. The other lines are the family
 
 import csv
 import io
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mtl_bench.core.columns import Column
 from mtl_bench.core.plain import did_you_mean
 from mtl_bench.report import evidence
 from mtl_bench.report.columns import DELTA, Row, column, measured, text
 from mtl_bench.report.evidence import Array, Comparison, Estimate
-from mtl_bench.report.statistics import axes_of, by_recipe, cell_of, own_and_shared
+from mtl_bench.report.statistics import (
+    axes_of,
+    by_recipe,
+    cell_of,
+    own_and_shared,
+    recipe_of,
+)
 from mtl_bench.report.table import FEWER, Cell, Head, Section, TableRow
 from mtl_bench.report.tuned import note
 
@@ -41,6 +49,16 @@ class Scores:
     others: tuple[Array, ...]  # the same by the other definitions of a delta, percent
     step_LMN: Array  # ms; NaN: unknown
 
+    def within(self, chosen_M: NDArray[np.bool_]) -> "Scores":
+        """Those of some problems."""
+        return replace(
+            self,
+            problems=tuple(itertools.compress(self.problems, chosen_M)),
+            gain_LMN=self.gain_LMN[:, chosen_M],
+            others=tuple(other_LMN[:, chosen_M] for other_LMN in self.others),
+            step_LMN=self.step_LMN[:, chosen_M],
+        )
+
 
 @dataclass(frozen=True)
 class Line:
@@ -49,7 +67,7 @@ class Line:
     label: str
     comparison: Comparison  # over all problems
     iqm: Estimate  # of its own gains over all problems
-    step_x: float  # its step time over the control's, mean over blocks
+    step_x: float  # its step time over the control's, each of its fastest run; mean over problems
     by_problem: tuple[Comparison, ...]  # tested by Student: a problem has few seeds
     without: tuple[Comparison, ...]  # of all problems but one; of one problem none
     rank: float  # by mean gain, the control among them; NaN for a line that lacks a problem
@@ -65,6 +83,7 @@ class Verdicts:
     lines: tuple[Line, ...]
     scores: Scores
     smoke: bool
+    left_out: tuple[str, ...]  # problems in which the control has no gain
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -85,11 +104,17 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
         axis: the field of a cell that names a line.
         control: its value that the others are held against.
     """
+    recipes = by_recipe(rows)
     rows = [row for row in rows if row.get("status", "done") in ("done", "failed")]
     of = scores(rows, axis)
     if control not in of.labels:
         return None
     at = of.labels.index(control)
+    has_M = ~np.isnan(of.gain_LMN[at]).all(-1)
+    judged = {recipe_of(row) for row in rows if not math.isnan(_gain(row))}
+    left_out = [name for name in recipes if name not in judged]
+    left_out += itertools.compress(of.problems, ~has_M)
+    of = of.within(has_M)
     gain_LMN = of.gain_LMN
     rest = [i for i in range(len(of.labels)) if i != at]
     compare = partial(_compare, gain_LMN, at)
@@ -120,7 +145,7 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
     lines = [line for i, line in found.items() if i != at]
     lines.sort(key=lambda line: -np.nan_to_num(line.comparison.difference.mean, nan=-1e9))
     smoke = any(row.get("smoke") for row in rows)
-    return Verdicts(found[at], tuple(lines), of, smoke)
+    return Verdicts(found[at], tuple(lines), of, smoke, tuple(left_out))
 
 
 def scores(rows: Sequence[Row], axis: str) -> Scores:
@@ -169,17 +194,15 @@ def sections(found: Verdicts, tune: Any = None) -> list[Section]:
 
 
 def sentence(found: Verdicts) -> str:
-    """What the whole comparison says, in one sentence."""
+    """What the whole comparison says, in one sentence: counts, and what it costs."""
     total, control = len(found.lines), found.control.label
     of = {word: [x for x in found.lines if x.comparison.verdict == word] for word in VERDICTS}
-    cost = [line.step_x for line in of["better"] if not math.isnan(line.step_x)]
-    at = f" (at {np.median(cost):.2f} times its step time)" if cost else ""
     suite = f" over {len(found.problems)} problems" if len(found.problems) > 1 else ""
     return (
         f"{len(of['better'])} of {total} line{'s' * (total > 1)} beat{'s' * (total == 1)} "
-        f"{control}{suite}{at}, {len(of['equivalent'])} {_are(of['equivalent'])} equivalent within "
-        f"{evidence.MARGIN:g} point, {len(of['worse'])} {_are(of['worse'])} worse, "
-        f"{len(of['open'])} {_are(of['open'])} open."
+        f"{control}{suite}{_at(of['better'])}, {len(of['equivalent'])} {_are(of['equivalent'])} "
+        f"equivalent within {evidence.MARGIN:g} point{_at(of['equivalent'])}, {len(of['worse'])} "
+        f"{_are(of['worse'])} worse, {len(of['open'])} {_are(of['open'])} open{_lacking(found)}."
     )
 
 
@@ -195,8 +218,10 @@ def protocol(found: Verdicts, tune: Any = None) -> str:
     blocks = max(line.comparison.blocks for line in found.lines)
     seeds = ", ".join(map(str, found.scores.seeds))
     several = f" x {len(found.problems)} problems" if len(found.problems) > 1 else ""
+    if tune is not None:
+        budget = f"{note(tune)} Intervals are over the results' seeds, not over other trials."
     return (
-        f"{budget if tune is None else note(tune)} Results: seeds {seeds}{several}, n = {blocks} "
+        f"{budget} Results: seeds {seeds}{several}, n = {blocks} "
         f"blocks; family: {len(found.lines)} line{'s' * (len(found.lines) > 1)} against "
         f"{found.control.label}, sign-flip test, two-sided, by Holm at "
         f"{1 - evidence.LEVEL:.2g}; margin of equivalence: {evidence.MARGIN:g} point."
@@ -210,10 +235,11 @@ def untested(control: str, lines: Sequence[str]) -> str:
         lines: their names.
     """
     if control not in lines:
-        return f"Nothing is tested against '{control}': no such line{did_you_mean(control, lines)}."
+        why = f"no such line has numbers{did_you_mean(control, lines)}"
+        return f"Nothing is tested against '{control}': {why}."
     return (
         f"Nothing is tested against '{control}': it takes two seeds or problems in which this line "
-        "and another have a log gain; the baseline of the gain has none."
+        "and another have a log gain. The baseline of the gain has none; stale runs do not count."
     )
 
 
@@ -231,11 +257,13 @@ def notes(found: Verdicts) -> list[str]:
         f"Differences are paired by problem and seed ({made}, n = {blocks} blocks); their interval "
         "is Student's, over the given problems. p: sign-flip test, two-sided, by Holm over the "
         f"family of {len(found.lines)} lines. Equivalent: the 90 % interval lies inside "
-        f"+-{evidence.MARGIN:g} point. IQM: mean of the middle half of a line's own gains, with a "
-        "bootstrap over seeds.",
+        f"+-{evidence.MARGIN:g} point. P(X>Y): share of blocks in which the line is ahead. IQM: "
+        "mean of the middle half of a line's own gains, with a bootstrap over seeds at 95 %, which "
+        "covers about 91 % with five.",
         f"Rank: by mean gain, {found.control.label} among the lines; below it the range over "
         "definitions of the delta (log gain, flat, by task)"
-        f"{' and left-out problems' * several}, and the middle 95 % over resampled seeds.",
+        f"{' and left-out problems' * several}, and the middle 95 % over resampled seeds. Step: of "
+        "each line's fastest run, since other work on a machine only slows one.",
     ]
     if several:
         said.append(
@@ -243,10 +271,19 @@ def notes(found: Verdicts) -> list[str]:
             "seeds, of all by the sign-flip test. Verdicts hold for these problems; the last "
             "columns leave out each of them in turn."
         )
-    if any(line.comparison.blocks < blocks for line in found.lines):
+    if found.left_out:
+        said.append(
+            f"Left out: {', '.join(found.left_out)}, where {found.control.label} has no log gain: "
+            "its own numbers or the baseline's are missing."
+        )
+    if any(has_fewer(line, found) for line in found.lines):
         said.append(
             f"{FEWER} Fewer blocks than another line: runs are missing, and a line without any run "
             "of a problem has no rank."
+        )
+    if any(np.isfinite(d.mean) and np.isnan(d.low) for d in _differences(found)):
+        said.append(
+            "No interval: a single run of a problem has no spread. Such a line is never equivalent."
         )
     failed = sum(line.comparison.failed for line in found.lines)
     if failed:
@@ -289,6 +326,11 @@ def band(line: Line) -> tuple[float, float]:
     """The best and the worst rank of a line by any choice or draw."""
     both = (line.chosen, line.drawn)
     return min(low for low, _ in both), max(high for _, high in both)
+
+
+def has_fewer(line: Line, found: Verdicts) -> bool:
+    """Whether runs of a line are missing that another has."""
+    return line.comparison.blocks < max(each.comparison.blocks for each in found.lines)
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -344,14 +386,15 @@ def _compare(
 
 
 def _ratio(step_MN: Array, control_MN: Array) -> float:
-    both = ~np.isnan(step_MN) & ~np.isnan(control_MN)
-    return float(np.mean(step_MN[both] / control_MN[both])) if both.any() else math.nan
+    """Of the fastest runs, since what else a machine does only makes some slower."""
+    ratio_M = np.fmin.reduce(step_MN, axis=1) / np.fmin.reduce(control_MN, axis=1)
+    known_M = ~np.isnan(ratio_M)
+    return float(ratio_M[known_M].mean()) if known_M.any() else math.nan
 
 
 def _over_all(found: Verdicts, tune: Any) -> Section:
     """A line each: difference with its interval, P(X > Y), p by Holm, verdict, rank, cost."""
     control = found.control.label
-    most = max(line.comparison.blocks for line in found.lines)
     heads = (
         Head("line", left=True),
         Head("blocks"),
@@ -368,7 +411,7 @@ def _over_all(found: Verdicts, tune: Any) -> Section:
     return Section(
         heading=f"Against {control}",
         heads=heads,
-        lines=(*(_table_row(line, most) for line in found.lines), own),
+        lines=(*(_table_row(line, found) for line in found.lines), own),
         source=f"{sentence(found)} {protocol(found, tune)}",
         caption=" ".join(
             [f"Against {control}.", sentence(found), protocol(found, tune), *notes(found)]
@@ -403,21 +446,21 @@ def _by_problem(found: Verdicts) -> Section:
 def _stands(line: Line, problems: Sequence[str]) -> str:
     """Whether the verdict stays, whatever problem is left out."""
     own = line.comparison.verdict
-    other = [
-        f"{each.verdict} without {problem}"
-        for problem, each in zip(problems, line.without, strict=True)
-        if each.verdict != own
-    ]
-    return ", ".join(other) or f"{own}, whichever"
+    other: dict[str, list[str]] = {}
+    for problem, each in zip(problems, line.without, strict=True):
+        if each.verdict != own:
+            other.setdefault(each.verdict, []).append(problem)
+    said = [f"{verdict} without {' or '.join(without)}" for verdict, without in other.items()]
+    return "; ".join(said) or f"{own}, whichever"
 
 
-def _table_row(line: Line, most: int) -> TableRow:
+def _table_row(line: Line, found: Verdicts) -> TableRow:
     each = line.comparison
     of, p = each.difference, each.p_holm
     between = "-" if np.isnan(of.low) else f"{_signed(of.low)} ... {_signed(of.high)}"
     return TableRow.of(
         line.label,
-        f"{each.blocks}{FEWER * (each.blocks < most)}",
+        f"{each.blocks}{FEWER * has_fewer(line, found)}",
         Cell(_marked(each), bold=each.verdict == "better", value=of.mean),
         between,
         f"{each.superior:.2f}",
@@ -447,6 +490,24 @@ def _rank(line: Line) -> Cell:
         return Cell("-")
     best, worst = band(line)
     return Cell(f"{line.rank:g}", f"({best:g} ... {worst:g})", value=line.rank)
+
+
+def _differences(found: Verdicts) -> list[Estimate]:
+    return [line.comparison.difference for line in found.lines]
+
+
+def _at(lines: Sequence[Line]) -> str:
+    """What lines cost, where it is known."""
+    cost = [line.step_x for line in lines if not math.isnan(line.step_x)]
+    median = " in the median" * (len(cost) > 1)
+    return f" (at {np.median(cost):.2f} times its step time{median})" if cost else ""
+
+
+def _lacking(found: Verdicts) -> str:
+    """How many of the lines are judged by some of the runs alone."""
+    count = sum(has_fewer(line, found) for line in found.lines)
+    lines = f"{count} line{'s' * (count > 1)} lack{'s' * (count == 1)} runs ({FEWER})"
+    return f"; {lines}" if count else ""
 
 
 def _are(lines: Sequence[Line]) -> str:

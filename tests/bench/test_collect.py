@@ -174,6 +174,26 @@ def test_a_stale_row_without_weights_is_not_trained_again_unasked(other, tmp_pat
     assert not store.can_renew(cell, runs)  # what there was would be of no use
 
 
+def test_what_other_code_made_comes_where_it_is_asked_for_and_replaces_nothing(other, tmp_path):
+    runs, pack, old = tmp_path / "runs", tmp_path / "rows.xz", deepcopy(provenance.code(cell_of()))
+    old["train"]["harness"] = "another"
+    for seed in (1, 2, 3):
+        write(other, cell_of("fixed", seed), code=old)
+    said = run("--pack", pack, "--runs", other, "--stale").splitlines()
+    assert said[0].startswith(f"packed 7 of {other}")
+    assert run("--pack", tmp_path / "less.xz", "--runs", other).startswith("packed 4 ")
+
+    write(runs, cell_of("fixed", 1), pq=1.0)  # done
+    write(runs, cell_of("fixed", 2), pq=2.0, code=old)  # as stale as the other
+    kept = contents(runs)
+    assert "left out, stale: 3 (train: harness changed)" in run(pack, "--runs", tmp_path / "none")
+    said = run(pack, "--runs", runs, "--stale").splitlines()
+    assert said[0] == f"collected 5 into {runs}"
+    assert said[1].startswith("left out, already here: 2: ")
+    assert kept.items() <= contents(runs).items()
+    assert store.status(cell_of("fixed", 3), runs) == "stale"
+
+
 def test_sources_that_are_none_are_one_line_before_anything_is_taken(other, tmp_path):
     runs, empty, foreign = tmp_path / "runs", tmp_path / "empty", tmp_path / "foreign.xz"
     empty.mkdir()
@@ -191,6 +211,8 @@ def test_sources_that_are_none_are_one_line_before_anything_is_taken(other, tmp_
     assert "is --runs itself" in run(other, "--runs", other, code=2)
     assert "nothing to collect" in run(code=2)
     assert "--curves goes with --pack" in run(other, "--curves", code=2)
+    assert "--smoke goes with --pack FILE.xz --grid NAME" in run(other, "--smoke", code=2)
+    assert "--seeds goes with --pack" in run("--pack", foreign, "--seeds", 3, code=2)
     assert "--weights does not go with --pack" in run("--weights", "--pack", foreign, code=2)
 
 
@@ -288,8 +310,9 @@ def test_a_line_that_this_version_cannot_read_hurts_no_other(other, tmp_path):
     run("--pack", pack, "--runs", other)
     lines = lzma.decompress(pack.read_bytes()).decode().splitlines()
     values = json.loads(lines[1])
-    for change in ({"cell": {**values["cell"], "later": 1}}, {"row": 3}, {"cell": None}):
-        more = json.dumps({**values, **change})
+    changes = ({"cell": {**values["cell"], "later": 1}}, {"row": 3}, {"cell": None})
+    others = [{**values, **change} for change in (*changes, {"curve.csv": 3})]
+    for more in map(json.dumps, [*others, 3, [values], None]):
         pack.write_bytes(lzma.compress("\n".join([*lines, more]).encode()))
         text = run(pack, "--runs", runs)
         assert "left out, unreadable: 1 (" in text

@@ -135,6 +135,7 @@ on_a_node = pytest.mark.skipif(bool(lacking), reason=lacking or "it is here")
 def node(tmp_path_factory):
     with slurm_node.running(tmp_path_factory.mktemp("slurm")):
         yield
+    assert list(Path.cwd().glob("slurm-*.out")) == []  # the log of a job that nobody gave a place
 
 
 def submit(todo, runs, **behaviour):

@@ -94,6 +94,13 @@ def test_a_metric_that_a_trial_lacks_or_that_is_no_number_makes_it_the_worst(gri
     assert tuning.chosen(grid, tmp_path)["cagrad", "conflict"].trial.number == 1
 
 
+def test_where_no_trial_of_a_problem_has_a_number_the_published_settings_stand(grid, tmp_path):
+    for trial in tuning.trials(grid):
+        finish(trial.cell, tmp_path, math.nan)
+    choices = tuning.chosen(grid, tmp_path).values()
+    assert {(choice.trial.number, choice.score) for choice in choices} == {(0, -math.inf)}
+
+
 def test_results_have_the_chosen_settings_the_grids_seeds_and_the_recipes_split(grid, tmp_path):
     for trial, error in zip(of(grid, "cagrad"), (1.0, 2.0, 0.5), strict=True):
         finish(trial.cell, tmp_path, error)
@@ -135,11 +142,13 @@ def test_recipe_takes_one_problem_of_a_suite_as_the_suite_has_it(tmp_path):
     assert [c.id for c in part.cells] == [c.id for c in whole.cells[:6]]
 
 
-def test_a_smoke_run_of_a_suite_is_short(tmp_path):
-    grid = load_grid(grid_file(tmp_path, SUITE), smoke=True)
+@pytest.mark.parametrize(("text", "cells"), [(SUITE, 6), (GRID, 3)], ids=["suite", "recipe"])
+def test_a_smoke_run_is_short(tmp_path, text, cells):
+    grid = load_grid(grid_file(tmp_path, text), smoke=True)
     assert grid.name == "mine-smoke"
+    assert {c.recipe.name for c in grid.cells} <= {"scales", "conflict"}
     assert all(c.recipe.smoke and c.recipe.optim.steps == 6 for c in grid.cells)
-    assert (len(grid.cells), grid.tune.trials) == (6, 2)
+    assert (len(grid.cells), grid.tune.trials) == (cells, 2)
 
 
 @pytest.mark.parametrize(
@@ -150,6 +159,11 @@ def test_a_smoke_run_of_a_suite_is_short(tmp_path):
         ("[3]", "a suite lists recipes"),
         ('[{ backbone = "mlp" }]', "a suite lists recipes"),
         ('[{ recipe = "scales", "recipe.optim.rate" = 1 }]', "unknown key"),
+        ("[]", 'line 2: a suite needs a recipe: suite = ["NAME", ...]'),
+        ('["scales", { recipe = "scales", seed = 4 }]', "'scales' stands twice in the suite"),
+        ('["scales"]\nrecipe = "conflict"', "line 3: leave out 'recipe': the suite names"),
+        ('["scales"]\nsmoke_recipe = "smoke"', "line 3: leave out 'smoke_recipe': the suite"),
+        ('["scales"]\n[[row]]\nname = "a"\nrecipe = "digits"', "line 5: leave out 'recipe'"),
     ],
 )
 def test_a_wrong_suite_is_told_with_its_line(tmp_path, suite, said):
@@ -238,6 +252,13 @@ def test_ablate_tries_chooses_and_reports_and_a_second_start_goes_on(tmp_path, r
     cells.clear()
     assert call("ablate", file, tmp_path).exit_code == 0
     assert cells == []
+
+
+def test_a_setting_that_a_line_cannot_have_is_told_before_a_trial_runs(tmp_path, ran):
+    space = GRID + '[tune.space]\n"method.c" = [0.1]\n'
+    result = call("ablate", grid_file(tmp_path, space), tmp_path)
+    assert "method 'fixed' has no 'c'" in result.output
+    assert ran[0] == []
 
 
 def test_a_result_is_against_the_tuned_baseline_of_its_seed_and_a_failure_stands(tmp_path, ran):

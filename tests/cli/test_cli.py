@@ -152,6 +152,13 @@ def test_wrong_usage_is_one_line_and_exit_code_2(words, message):
     assert message in one_line(*words.split())
 
 
+def test_a_data_set_without_a_check_says_so(tmp_path):
+    (tmp_path / "camera.txt").write_text("1 1 0 0 1\n")
+    plug_ins = Path(__file__).parents[1] / "plugins"
+    said = one_line("data", "check", tmp_path, "--plugins", plug_ins)
+    assert "the data set 'rooms' has no check; `mtl-bench check rooms` tests" in said
+
+
 @pytest.mark.parametrize(
     "words", ["ablat", "ablate", "ablate --grid", "list thing", "ablate --jobs 0"]
 )

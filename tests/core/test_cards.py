@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from mtl_bench.cli.app import app
 from mtl_bench.core import cards, plugins
+from mtl_bench.core.declared import GIVEN
 
 FOLDER = Path(__file__).resolve().parents[2] / "methods"
 SHIPPED = sorted(FOLDER.glob("[!_]*.py"))
@@ -77,7 +78,7 @@ def test_cards_say_what_the_classes_are(name):
     if method.batches > 1 and ahead not in card.extras:
         assert f"{method.batches} batches" in card.extras
     constructor = inspect.signature(type(method).__init__).parameters
-    assert list(card.settings) == [key for key in constructor if key not in plugins.GIVEN]
+    assert list(card.settings) == [key for key in constructor if key not in GIVEN]
 
 
 def test_the_readme_is_what_the_command_prints():

@@ -16,6 +16,8 @@ from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.deploy import export
 from mtl_bench.deploy.agreement import equal_share
 from mtl_bench.deploy.graph import strided
+from mtl_bench.deploy.subject import untrained
+from mtl_bench.tasks.panoptic import Panoptic
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -155,6 +157,22 @@ def test_what_is_made_for_one_size_says_so(tmp_path):
     net.backbone.register_forward_hook(lambda *given: given[-1] | {32: given[-1][32] + place})
     with pytest.raises(ValueError, match="made for one size: leave out --dynamic"):
         export.export(net, SIZE, tmp_path / "net.onnx", "none", multiple=32)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("post", ["inside", "apart"])
+def test_two_outputs_of_one_name_are_refused(tmp_path, monkeypatch, post):
+    monkeypatch.setattr(Panoptic, "exported", ("depth",))
+    with pytest.raises(ValueError, match="two outputs of the file are called 'depth': leave out"):
+        written(tmp_path, post)
+    assert list(tmp_path.iterdir()) == []
+    written(tmp_path, "none")  # which has the maps alone
+
+
+def test_a_result_of_a_map_s_name_cannot_be_apart_from_it(tmp_path):
+    net = untrained("tiny", "dense-small", ("normals",))[1].net.eval()
+    with pytest.raises(ValueError, match="'normals' would be an input and an output"):
+        export.export(net, SIZE, tmp_path / "net.onnx", "apart")
     assert list(tmp_path.iterdir()) == []
 
 

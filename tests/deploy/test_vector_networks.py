@@ -99,3 +99,12 @@ def test_the_exported_file_computes_what_the_network_does(folder, tmp_path, reci
         (name,) = task.exported
         expected, own = results[task.name][name], torch.from_numpy(found[f"{name}:{task.field}"])
         torch.testing.assert_close(own.float(), expected.float(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("recipe", ["scales", pytest.param("celeba-cnn9", marks=pytest.mark.slow)])
+def test_a_network_of_one_size_has_no_free_one(folder, tmp_path, recipe):
+    what = network(recipe, folder)
+    size = "x".join(map(str, what.size))
+    with pytest.raises(ValueError, match=f"one vector, and is made for {size} alone: leave it"):
+        export.export(what.net, what.size, tmp_path / "net.onnx", "none", multiple=1)
+    assert list(tmp_path.iterdir()) == []

@@ -168,6 +168,19 @@ def test_verdicts():
     assert found[0].p_holm >= found[0].p
 
 
+def test_what_is_tested_is_the_mean_that_is_printed():
+    """Runs are missing: a block of the shorter problem weighs more, by brute force."""
+    d = np.array([[1.0, 1.2, 0.8, 1.1, 0.9], [-1.5, -2.0, NAN, NAN, NAN]])
+    (found,) = compare(d[None], np.zeros((2, 5)))
+    assert np.nansum(d) > 0 > found.difference.mean
+    assert not found.ahead
+    known = ~np.isnan(d)
+    part = (d / known.sum(1, keepdims=True))[known]
+    patterns = np.array(list(itertools.product([1, -1], repeat=7)))
+    as_far = np.abs(patterns @ part) >= abs(part.sum()) - 1e-12
+    assert found.p == as_far.mean()
+
+
 def test_lines_that_fail_together_are_not_equivalent():
     control = RNG.normal(0, 1, (1, 4))
     control[0, 2] = FAILED
@@ -263,10 +276,13 @@ def test_rank_bands_are_the_ends_over_all_choices():
     kept = [[0, 1, 2], [1, 2], [0, 2], [0, 1]]
     every = np.array([ranked(s[:, problems]) for s in (first, second) for problems in kept])
     assert choices.tolist() == np.stack([every.min(0), every.max(0)], 1).tolist()
-    whole = np.nan_to_num(first, nan=0.5)  # without it, some resamples lack a line
-    _, seeds = rank_bands([whole], resamples=4000)
     draws = itertools.product(itertools.product(range(2), repeat=2), repeat=3)
-    drawn = [ranked(np.stack([whole[:, m, list(d[m])] for m in range(3)], 1)) for d in draws]
+    drawn = []
+    for d in draws:
+        several = np.stack([first[:, m, list(d[m])] for m in range(3)], 1)
+        if np.isnan(several[2, 2]).all():
+            several[2, 2] = np.nanmean(first[2, 2])  # a line without a drawn run: its mean
+        drawn.append(ranked(several))
     ends = np.percentile(drawn, [2.5, 97.5], axis=0, method="inverted_cdf").T
     assert np.abs(seeds - ends).max() <= 0.5
 
@@ -275,6 +291,17 @@ def test_a_line_that_lacks_every_run_has_no_rank():
     choices, seeds = rank_bands([np.array([[[1.0, 2]], [[NAN, NAN]]])], resamples=20)
     assert choices[0].tolist() == seeds[0].tolist() == [1, 1]
     assert np.isnan([choices[1], seeds[1]]).all()
+
+
+def test_a_line_that_lacks_a_problem_moves_no_other_s_rank():
+    scores = RNG.normal(0, 1, (5, 3, 4))
+    scores[1, 2] = NAN
+    others = [0, 2, 3, 4]
+    found = rank_bands([scores, scores**3], resamples=200)
+    alone = rank_bands([scores[others], scores[others] ** 3], resamples=200)
+    for ours, theirs in zip(found, alone, strict=True):
+        assert np.isnan(ours[1]).all()
+        assert ours[others].tolist() == theirs.tolist()
 
 
 # --- coverage -------------------------------------------------------------------------------------

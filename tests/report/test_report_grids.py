@@ -370,6 +370,25 @@ def test_numbers_of_many_points_do_not_overlap():
     assert overlaps == []
 
 
+def test_the_front_of_many_holds_those_out_of_view(tmp_path, monkeypatch):
+    fronts = []
+    monkeypatch.setattr(plots, "draw_front", lambda axes, points, better: fronts.append(points))
+    rows = methods(14)
+    far = [row for row in rows if row["method"] == "method_3"]
+    for row in far:
+        row["metric"] |= {"panoptic.pq": 95.0, "depth_median.rmse": 0.1}
+    caption = plots.against(
+        tabulate(rows, Layout(rows="method")), column("pq"), column("rmse"), tmp_path
+    )
+    assert "Further out: method_3 95.0 at 0.1" in caption
+    ((x, y),) = [point for point in fronts[0] if point[1] > 90]
+    assert (x, y) == pytest.approx((0.1, 95.0))
+    assert len(fronts[0]) == 14
+    drawing = (tmp_path / "pq_rmse.svg").read_text()
+    assert ">14<" in drawing
+    assert ">4<" not in drawing  # its number is not beside a point
+
+
 def test_a_report_of_many_methods_is_small_and_whole(tmp_path):
     rows = methods(30)
     runs = write_runs(tmp_path / "runs", rows)

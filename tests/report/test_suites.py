@@ -13,11 +13,20 @@ from scipy import stats
 
 from mtl_bench.core import style
 from mtl_bench.report import grid as report
+from mtl_bench.report import verdict_plots
 from mtl_bench.report.grid import Layout, by_problem, fill, tabulate
 from mtl_bench.report.page import beside
 from mtl_bench.report.statistics import FEW
 from mtl_bench.report.verdict_plots import LEADERS, bands, forest, highlighted, profiles
-from mtl_bench.report.verdicts import ALL, judge, notes, records, sections, sentence
+from mtl_bench.report.verdicts import (
+    ALL,
+    VERDICTS,
+    judge,
+    notes,
+    records,
+    sections,
+    sentence,
+)
 
 LINES = {"ahead": 3.0, "same": 0.0, "behind": -3.0, "far": -60.0, "a_line_with_a_long_name": 0.05}
 
@@ -67,7 +76,8 @@ def test_the_whole_is_paired_over_problems_and_each_is_tested_by_its_seeds(rows,
         )
     assert sentence(found) == (
         "1 of 5 lines beat scalarised over 3 problems (at 1.50 times its step time), 2 are "
-        "equivalent within 1 point, 2 are worse, 0 are open."
+        "equivalent within 1 point (at 1.25 times its step time in the median), 2 are worse, 0 are "
+        "open."
     )
 
 
@@ -94,7 +104,7 @@ def test_a_verdict_that_hangs_on_one_problem_is_told(rows):
     assert "*" not in scales["a_line_with_a_long_name"].text
 
 
-def test_a_line_that_lacks_a_problem_has_fewer_blocks_and_no_rank(rows):
+def test_a_line_that_lacks_a_problem_has_fewer_blocks_and_no_rank(rows, tmp_path):
     rows = [r for r in rows if (r["method"], r["cell"]["recipe"]["name"]) != ("same", "dense")]
     found = judge(rows, "method", CONTROL)
     line = next(line for line in found.lines if line.label == "same")
@@ -103,7 +113,9 @@ def test_a_line_that_lacks_a_problem_has_fewer_blocks_and_no_rank(rows):
     row = next(x for x in sections(found)[0].lines if x.cells[0].text == "same")
     assert (row.cells[1].text, row.cells[8].text) == ("10\u2020", "-")
     assert "same" not in [line.label for line in found.ranked]
+    assert "Absent: 1 line without a run of some problem." in bands(found, tmp_path, "bands")
     assert any("Fewer blocks than another line" in note for note in notes(found))
+    assert sentence(found).endswith("0 are open; 1 line lacks runs (\u2020).")
 
 
 def test_a_problem_without_any_gain_is_none(rows):
@@ -111,7 +123,26 @@ def test_a_problem_without_any_gain_is_none(rows):
     for row in rows:
         if row["cell"]["recipe"]["name"] == "dense":
             row["metric"].pop("delta.gain", None)
-    assert judge(rows, "method", CONTROL).problems == ("scales", "digits")
+        if row["cell"]["recipe"]["name"] == "digits":
+            row.update(status="missing", metric={})
+    found = judge(rows, "method", CONTROL)
+    assert (found.problems, found.left_out) == (("scales",), ("digits", "dense"))
+    said = f"Left out: digits, dense, where {CONTROL} has no log gain: its own numbers or the"
+    assert any(note.startswith(said) for note in notes(found))
+
+
+def test_a_problem_that_the_control_lacks_is_left_out(rows):
+    rows = json.loads(json.dumps(rows))
+    for row in rows:
+        if (row["cell"]["recipe"]["name"], row["method"]) == ("dense", CONTROL):
+            row.update(status="missing", metric={})
+    found = judge(rows, "method", CONTROL)
+    kept = [row for row in rows if row["cell"]["recipe"]["name"] != "dense"]
+    assert (found.problems, found.left_out) == (("scales", "digits"), ("dense",))
+    assert found.lines == judge(kept, "method", CONTROL).lines
+    assert found.control.rank == 3
+    rest = [row for row in rows if row["cell"]["recipe"]["name"] == "dense"]
+    assert judge(rest, "method", CONTROL) is None
 
 
 def test_a_failed_baseline_is_no_line(rows):
@@ -162,7 +193,9 @@ def test_few_lines_keep_their_rule(rows):
     names = ("baseline", CONTROL, "ahead", "behind")
     assert len(names) == FEW
     results = tabulate([row for row in rows if row["method"] in names], layout)
-    assert "ahead of every other plain line" in fill(results).notes[0]
+    assert "Bold: ahead of every other plain line" in fill(results).notes[0]
+    results = tabulate([row for row in rows if row["method"] in names], layout, problem="scales")
+    assert "Bold in scales, where nothing is tested: ahead" in fill(results).notes[0]
 
 
 def test_the_report_has_all_of_it(rows, tmp_path):
@@ -222,6 +255,87 @@ def test_many_lines_stay_legible(tmp_path):
     colors = [look.color for _, look in highlighted(found)]
     assert len(colors) == 35
     assert len(set(colors)) == LEADERS + 2  # and the control's, and gray
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved."""
+    kept = []
+    monkeypatch.setattr(verdict_plots, "save", lambda figure, *_: kept.append(figure))
+    return kept
+
+
+@pytest.mark.parametrize("draw", [forest, bands, profiles])
+def test_a_legend_of_all_verdicts_fits(drawn, tmp_path, draw):
+    lines = {f"method_{i}": (3.0, 0.0, -3.0, 0.8)[i % 4] for i in range(12)}
+    found = judge(suite_rows(lines, noise=1.5), "method", CONTROL)
+    assert {line.comparison.verdict for line in found.lines} == set(VERDICTS)
+    assert draw(found, tmp_path, "figure")
+    (figure,) = drawn
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert (box.x0, box.y0) >= (0, 0)
+    assert box.x1 <= figure.bbox.width
+    assert box.y1 <= figure.bbox.height
+
+
+def test_an_interval_that_goes_on_out_of_view_has_an_arrow(drawn, tmp_path):
+    rows = suite_rows({**{f"method_{i}": i / 10 for i in range(12)}, "far": -40.0, "wide": 0.0})
+    for row in rows:
+        if row["method"] == "wide" and row["seed"] == 0:
+            row["metric"]["delta.gain"] -= 8
+    assert "an arrow: it goes on further out" in forest(
+        judge(rows, "method", CONTROL), tmp_path, "forest"
+    )
+    (axes,) = (axes for axes in drawn[0].axes if axes.get_title() == ALL)
+    marks = {line.get_marker() for line in axes.lines}
+    arrows = [line for line in axes.lines if line.get_marker() == "<"]
+    assert ({"o", "<"} <= marks, len(arrows)) == (True, 2)
+    assert [text.get_text() for text in axes.texts] == ["-40"]
+
+
+def test_a_mean_without_an_interval_is_hollow(drawn, tmp_path):
+    rows = [
+        row
+        for row in suite_rows({"one": 0.0, "whole": 0.0})
+        if row["method"] != "one" or row["seed"] == 0
+    ]
+    caption = forest(judge(rows, "method", CONTROL), tmp_path, "forest")
+    assert "Hollow: a single run of a problem" in caption
+    faces = [
+        line.get_markerfacecolor() for line in drawn[0].axes[-1].lines if line.get_marker() == "o"
+    ]
+    assert [face == "white" for face in faces].count(True) == 1
+    rows = [row for row in rows if row["method"] != "one"]
+    assert "Hollow" not in forest(judge(rows, "method", CONTROL), tmp_path, "forest")
+
+
+def test_cells_of_a_suite_without_numbers_name_their_problem(rows):
+    rows = json.loads(json.dumps(rows))
+    fail(rows[0])
+    table = fill(tabulate(rows[:1], Layout(rows="method", control=CONTROL), problem="scales"))
+    (section,) = table.lacking
+    assert section.lines[0].cells[0].text == "scales: baseline, seed 0"
+
+
+def test_many_cells_that_lack_numbers_for_one_reason_share_a_line(rows):
+    rows = json.loads(json.dumps(rows))
+    for row in rows[:8]:
+        row["status"], row["error"] = "missing", "its trials have not ended"
+    fail(rows[8])
+    table = fill(tabulate(rows[:9], Layout(rows="method", control=CONTROL), problem="scales"))
+    (section,) = table.lacking
+    assert [line.cells[1].text for line in section.lines] == ["missing", "failed"]
+    assert section.lines[0].cells[0].text.startswith("scales: 8 cells, ")
+
+
+def test_profiles_say_how_many_runs_are_out_of_view(tmp_path):
+    rows = suite_rows({**{f"method_{i}": 0.0 for i in range(4)}, "far": -40.0})
+    said = profiles(judge(rows, "method", CONTROL), tmp_path, "profiles")
+    assert "Out of view: 15 below of 90 runs." in said
+    rows = [row for row in rows if row["method"] != "far"]
+    assert "Out of view" not in profiles(judge(rows, "method", CONTROL), tmp_path, "profiles")
 
 
 def test_no_figure_where_there_is_nothing_to_show(tmp_path):

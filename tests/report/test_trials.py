@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from fake_suite import CONTROL, PROBLEMS, fail, suite_grid, suite_rows, suite_trials
 
+from mtl_bench.bench import tuning
 from mtl_bench.bench.space import Tune
 from mtl_bench.core import style
 from mtl_bench.report import grid as report
@@ -42,7 +43,7 @@ def of(tried, line, problem):
 
 def test_a_curve_is_the_mean_over_all_draws_and_problems(tried):
     """Brute force over every draw of two trials; a failed one is the worst of its problem."""
-    curve, seconds = trials._curve(CONTROL, "same", list(PROBLEMS), trials.ended(tried), 6)
+    curve, seconds = trials._curve(CONTROL, "same", list(PROBLEMS), tuning.ended(tried), 6)
     expected = []
     for problem in PROBLEMS:
         every = [t.score for t in tried if t.trial.problem == problem]
@@ -58,18 +59,18 @@ def test_a_curve_is_the_mean_over_all_draws_and_problems(tried):
 def test_trials_of_several_seeds_are_one_setting():
     (one,) = suite_trials({}, 1, {"digits": PROBLEMS["digits"]})
     other = replace(one, score=one.score + 2, task_scores=dict.fromkeys(one.task_scores, 1.0))
-    (setting,) = trials.ended([one, other])[CONTROL, "digits"]
+    (setting,) = tuning.ended([one, other])[CONTROL, "digits"]
     assert setting.score == one.score + 1
     assert setting.seconds == 20
-    assert setting.tasks == {k: (v + 1) / 2 for k, v in one.task_scores.items()}
+    assert setting.task_scores == {k: (v + 1) / 2 for k, v in one.task_scores.items()}
     bad = replace(one, score=-math.inf, task_scores={}, seconds=0.0)
-    (setting,) = trials.ended([one, bad])[CONTROL, "digits"]
-    assert (setting.score, setting.tasks) == (-math.inf, {})
-    assert trials.ended([one, replace(one, score=NAN)]) == {}
+    (setting,) = tuning.ended([one, bad])[CONTROL, "digits"]
+    assert (setting.score, setting.task_scores) == (-math.inf, {})
+    assert tuning.ended([one, replace(one, score=NAN)]) == {}
 
 
 def test_distances_are_the_least_steps_that_end_being_dominated(found, tried):
-    settings = trials.ended(tried)
+    settings = tuning.ended(tried)
     section = trials.distances(found, settings)
     shown = {line.cells[0].text: [c.value for c in line.cells[1:]] for line in section.lines}
     assert list(shown) == ["ahead", "same", "behind"]
@@ -90,14 +91,14 @@ def test_a_line_without_a_finished_trial_has_no_distance(found, tried):
     left = [t for t in tried if t.trial.line != "same"]
     bad = [replace(t, score=-math.inf, task_scores={}) for t in tried if t.trial.line == "same"]
     for several in (left, left + bad):
-        section = trials.distances(found, trials.ended(several))
+        section = trials.distances(found, tuning.ended(several))
         row = next(line for line in section.lines if line.cells[0].text == "same")
         assert {cell.text for cell in row.cells[1:]} == {"-"}
     assert row is section.lines[-1]
 
 
 def test_nothing_is_drawn_without_what_it_needs(found, tried, tmp_path):
-    settings = trials.ended(tried)
+    settings = tuning.ended(tried)
     others = {key: value for key, value in settings.items() if key[0] != CONTROL}
     one = {key: value[:1] for key, value in settings.items()}
     for lacking in ({}, others, one):
@@ -109,7 +110,7 @@ def test_nothing_is_drawn_without_what_it_needs(found, tried, tmp_path):
 
 def test_problems_that_have_not_ended_are_left_out_of_the_curves(found, tried, tmp_path):
     waiting = [replace(t, score=NAN) if t.trial.problem == "dense" else t for t in tried]
-    caption = trials.budgets(found, trials.ended(waiting), tmp_path, "x")
+    caption = trials.budgets(found, tuning.ended(waiting), tmp_path, "x")
     assert "mean over 2 problems" in caption
 
 

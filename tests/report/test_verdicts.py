@@ -40,6 +40,13 @@ def verdict_of(rows, name):
     return next(line.comparison for line in found.lines if line.label == name)
 
 
+def test_a_busy_machine_makes_no_line_dearer():
+    rows = suite(range(8))
+    for row in rows[::3]:  # a third of every line's runs, another one each time
+        row["time"]["step_ms"] *= 4
+    assert judge(rows, "method", "fixed").lines[0].step_x == 2.5
+
+
 def test_lines_are_told_apart_although_seeds_spread_wider():
     found = judge(suite(range(8)), "method", "fixed")
     verdicts = {line.label: line.comparison.verdict for line in found.lines}
@@ -48,8 +55,8 @@ def test_lines_are_told_apart_although_seeds_spread_wider():
     assert found.lines[0].comparison.difference.mean == pytest.approx(3, abs=0.4)
     assert found.lines[0].step_x == 2.5
     assert sentence(found) == (
-        "1 of 3 lines beat fixed (at 2.50 times its step time), 1 is equivalent within 1 point, "
-        "1 is worse, 0 are open."
+        "1 of 3 lines beat fixed (at 2.50 times its step time), 1 is equivalent within 1 point "
+        "(at 2.50 times its step time), 1 is worse, 0 are open."
     )
 
 
@@ -87,6 +94,11 @@ def test_few_seeds_are_said_to_be_too_few():
     assert any(note.startswith("With 3 blocks no line of 3 can be better") for note in notes(found))
     assert judge(suite(range(1)), "method", "fixed") is None
     assert judge(suite(), "method", "absent") is None
+    one = suite(range(4)) + suite(range(1), ("other",))
+    found = judge(one, "method", "fixed")
+    assert math.isnan(found.lines[0].comparison.difference.low)
+    assert any(note.startswith("No interval: a single run of a problem") for note in notes(found))
+    assert not any("No interval" in note for note in notes(judge(suite(), "method", "fixed")))
     assert judge([failed_row()], "method", "fixed") is None
 
 
@@ -105,7 +117,7 @@ def test_where_nothing_is_tested_the_page_says_why(tmp_path):
     page = report.build(grid_of("fixed"), suite(range(1)), tmp_path).read_text()
     assert "Nothing is tested against &#39;fixed&#39;: it takes two seeds or problems" in page
     page = report.build(grid_of("fixde"), suite(), tmp_path).read_text()
-    assert "no such line (did you mean &#39;fixed&#39;?)" in page
+    assert "no such line has numbers (did you mean &#39;fixed&#39;?)" in page
     assert not (tmp_path / "forest.png").exists()
 
 
@@ -121,7 +133,8 @@ def test_a_failed_run_is_told_in_table_and_picture(tmp_path):
     rest = [row for row in rows if row["seed"] != 2]
     caption = forest(judge(rest, "method", "fixed"), tmp_path, "forest")
     assert caption.endswith(
-        "0 of 3 lines beat fixed, 1 is equivalent within 1 point, 0 are worse, 2 are open."
+        "0 of 3 lines beat fixed, 1 is equivalent within 1 point (at 2.50 times its step time), "
+        "0 are worse, 2 are open."
     )
     assert ">1 failed<" in (tmp_path / "forest.svg").read_text()
 

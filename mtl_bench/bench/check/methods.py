@@ -6,12 +6,14 @@ Shapes: T losses, P shared parameters.
 import inspect
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from mtl_bench.bench.check.side_by_side import side_by_side
-from mtl_bench.bench.space import check as check_space
+from mtl_bench.bench.space import of_method
+from mtl_bench.core import plugins
 from mtl_bench.core.method import (
     GradientMethod,
     LookAheadMethod,
@@ -281,12 +283,10 @@ def _hard_jacobians(size: float) -> dict[str, Tensor]:
 
 
 def _space(kind: type[Method]) -> None:
-    """What may be tuned are hyper-parameters, and their values lie where trials can draw them."""
-    unknown = set(kind.space) - set(inspect.signature(kind).parameters)
-    if unknown:
-        raise ValueError(f"space has {sorted(unknown)}, which the constructor does not take")
-    for key, where in kind.space.items():
-        check_space(key, where)
+    """What may be tuned can be drawn, and trials read in the file what the class has."""
+    read = of_method(plugins.name_of(Path(inspect.getfile(kind))))
+    if read != kind.space:
+        raise ValueError(f"trials read space = {read} in the file, and the class has {kind.space}")
 
 
 def _replayable(kind: type[Method]) -> None:
