@@ -78,7 +78,7 @@ def assert_same(one, other, atol: float | None = None) -> None:
     assert first.keys() == second.keys()
     assert any("/optimizer/" in key for key in first)
     for key, value in first.items():
-        near = 1e-6 if ".running_" in key else atol
+        near = atol or (1e-6 if ".running_" in key else None)
         if near is not None and torch.is_tensor(value) and value.is_floating_point():
             torch.testing.assert_close(value, second[key], atol=near, rtol=near)
         elif torch.is_tensor(value):
