@@ -33,6 +33,7 @@ from mtl_bench.core.config import Cell
 from mtl_bench.core.files import read_json, write_json
 from mtl_bench.core.plain import to_dict
 from mtl_bench.core.provenance import cores
+from mtl_bench.core.ranks import ALONE, Ranks
 
 INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)  # exit codes of a job that was told to stop
 POLL_S = 0.2
@@ -240,6 +241,7 @@ class Launcher:
         data: those that cells run on.
         gpus: that cells are spread over, see `gpu_pool`: one each, and several on one only where
             there are more `jobs`. Empty: the processes see what this one sees.
+        ranks: that each cell starts, which is part of the command.
     """
 
     runs: Path
@@ -252,6 +254,7 @@ class Launcher:
     smoke: bool = False
     data: Data | None = None
     gpus: Sequence[str] = ()
+    ranks: int = 1
     _processes: Processes = field(default_factory=Processes)
     _running: list[Run] = field(default_factory=list)
     _unsettled: set[str] = field(default_factory=set)  # ids whose jobs have not ended here yet
@@ -348,7 +351,7 @@ class Launcher:
             taken = [each.gpu for each in self._running]
             run.gpu = min(self.gpus, key=taken.count)
         self._running.append(run)
-        environment = child_environment(self.jobs, run.gpu)
+        environment = child_environment(self.jobs, run.gpu, self.ranks)
         task = Task(
             run.job.id, command, run.log, environment=environment, fork=isinstance(run, CellRun)
         )
@@ -419,12 +422,26 @@ def gpu_pool(visible: str | None, count: int) -> tuple[str, ...]:
     return tuple(names)[:count]
 
 
-def child_environment(jobs: int, gpu: str | None = None) -> dict[str, str]:
-    """Of a job's process; processes side by side share the cores instead of fighting for them."""
-    extra = {locks.LAUNCHER: json.dumps(locks.process()), ORDERED: "1"}
+def together(pool: Sequence[str], each: int) -> tuple[str, ...]:
+    """So many GPUs for each cell, as CUDA_VISIBLE_DEVICES names them; the rest is not used.
+
+    Raises:
+        ValueError: there are GPUs, but fewer.
+    """
+    if len(pool) < each and pool:
+        raise ValueError(f"--gpus-per-cell {each}, but this process sees {len(pool)} GPUs")
+    return tuple(",".join(gpus) for gpus in zip(*[iter(pool)] * each, strict=False))
+
+
+def child_environment(jobs: int, gpu: str | None = None, ranks: int = 1) -> dict[str, str]:
+    """Of a job's process; processes side by side share the cores instead of fighting for them.
+
+    It is no rank of a cell of its own, even where this process is one of several.
+    """
+    extra = {locks.LAUNCHER: json.dumps(locks.process()), ORDERED: "1", "WORLD_SIZE": "1"}
     extra |= {"PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1"}
     if jobs > 1:
-        extra["OMP_NUM_THREADS"] = str(max(1, cores() // jobs))
+        extra["OMP_NUM_THREADS"] = str(max(1, cores() // (jobs * ranks)))
         extra[locks.SIDE_BY_SIDE] = str(jobs)
     if gpu is not None:
         extra["CUDA_VISIBLE_DEVICES"] = gpu
@@ -465,6 +482,7 @@ class Here:
         root: the data set.
         echo: where lines of text go.
         data: what cells are compared with; those in the root that need not be rendered for that.
+        ranks: that train each cell together; this process is their first.
     """
 
     runs: Path
@@ -473,6 +491,7 @@ class Here:
     wandb: str
     echo: Callable[[str], None]
     data: Data
+    ranks: Ranks = ALONE
 
     def run(self, cell: Cell, rerun: bool = False, stale: bool = False) -> None:
         """Run what is left of a cell, after the cells that it needs.
@@ -516,7 +535,8 @@ class Here:
                 if renewed:
                     renew(cell, directory, self.root, self.device, self.echo)
                 else:
-                    run_cell(cell, directory, self.root, self.device, self.wandb, self.echo)
+                    given = (self.root, self.device, self.wandb, self.echo, self.ranks)
+                    run_cell(cell, directory, *given)
         self.echo(f"{directory}/row.json")
 
     def _begin(self, cell: Cell, rerun: bool) -> None:

@@ -22,6 +22,8 @@ from mtl_bench.core.config import Cell
 from mtl_bench.core.dataset import dataset_of
 from mtl_bench.core.device import Compute, choose_device
 from mtl_bench.core.files import read_json, replacing, write_json
+from mtl_bench.core.plain import from_dict, to_dict
+from mtl_bench.core.ranks import ALONE, Processes, Ranks
 from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.samples import open_samples
 from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, open_walks, rehearse
@@ -29,7 +31,7 @@ from mtl_bench.model import Model
 from mtl_bench.train import checkpoint
 from mtl_bench.train.curve import data_share, training_time
 from mtl_bench.train.loop import CHECKPOINT, train
-from mtl_bench.train.progress import Interrupted, Progress
+from mtl_bench.train.progress import Interrupted, Listening, Progress
 from mtl_bench.train.tracking import Tracker
 
 CURVE = "curve.csv"
@@ -52,6 +54,7 @@ def run_cell(
     device: str = "auto",
     wandb: str = "off",
     echo: Callable[[str], None] = print,
+    ranks: Ranks = ALONE,
 ) -> dict[str, Any]:
     """Run what is left of a cell and write its row; every stage can be killed and run again.
 
@@ -59,6 +62,7 @@ def run_cell(
         run_dir: the cell's folder, which exists (see `store.begin`).
         root: the data set.
         echo: where lines of text go.
+        ranks: that train it together; this is their first, and the others `follow`.
 
     Returns:
         The row, as `row.json` has it.
@@ -67,11 +71,12 @@ def run_cell(
         ValueError: a parent of the cell has no result or no checkpoint, or the data set lacks what
             its evaluation or the video stage needs.
     """
-    compute = Compute(choose_device(device), cell.recipe.optim.precision)
+    compute = Compute(choose_device(device, ranks), cell.recipe.optim.precision)
     progress = Progress(run_dir, echo)
     progress.catch_signals()
     tracker = Tracker(wandb, cell, run_dir)
     code, environment = provenance.code(cell), provenance.environment(compute.device)
+    environment["ranks"] = ranks.size
     write_json(run_dir / "env.json", environment)
 
     data, tasks = Data(root), tasks_of_cell(cell)
@@ -85,7 +90,7 @@ def run_cell(
     if cell.single_task:
         trained = _trained_apart(cell, run_dir, compute, data)
     else:
-        trained = _train(cell, run_dir, root, compute, progress, tracker, data)
+        trained = _train(cell, run_dir, root, compute, progress, tracker, data, ranks)
     model, took = trained.model, trained.time
     echo(f"trained in {took['train_s']:.0f} s ({took['step_ms']:.0f} ms a step)")
 
@@ -189,6 +194,7 @@ def _train(
     progress: Progress,
     tracker: Tracker,
     data: Data,
+    ranks: Ranks,
 ) -> Trained:
     """Train, from the parent's checkpoint on where there is one, or with the weights of its curve;
     a video cell also on labels that this one made."""
@@ -211,14 +217,43 @@ def _train(
         torch.cuda.reset_peak_memory_stats(compute.device)
     given = (cell, root, run_dir, compute, progress, tracker)
     rehearsal = partial(rehearse, cell=cell, root=root, device=compute.device)
-    model = train(
-        *given, start=start, further_labels=further_labels, record=record, rehearse=rehearsal
-    )
+    paths = {"root": root, "run_dir": run_dir, "start": start, "record": record}
+    paths["further_labels"] = further_labels
+    told = {name: None if path is None else str(path.resolve()) for name, path in paths.items()}
+    ranks.tell({"cell": to_dict(cell), **told}, compute.device)
+    with ranks.sharing_cores():
+        model = train(
+            *given,
+            ranks=ranks,
+            start=start,
+            further_labels=further_labels,
+            record=record,
+            rehearse=rehearsal,
+        )
     taken["peak_mib"] = max(taken.get("peak_mib", 0.0), _peak_mib(compute.device))
     write_json(run_dir / TAKEN, taken)
     train_s, step_ms = training_time(run_dir / "curve.csv")
     waited = {"data_share": data_share(run_dir / "curve.csv")}
     return Trained(model, {"train_s": train_s, "step_ms": step_ms, **waited, **taken}, protocol)
+
+
+def follow(ranks: Processes, device: str = "auto") -> None:
+    """Of a rank behind the first: train with it what it trains, until it has ended."""
+    while (told := ranks.told()) is not None:
+        cell = from_dict(Cell, told.pop("cell"))
+        root, run_dir = Path(told.pop("root")), Path(told.pop("run_dir"))
+        paths = {name: None if path is None else Path(path) for name, path in told.items()}
+        compute = Compute(choose_device(device, ranks), cell.recipe.optim.precision)
+        progress = Listening(run_dir, print)
+        progress.catch_signals()
+        ranks.begin(compute.device)
+        train(
+            *(cell, root, run_dir, compute, progress, Tracker("off", cell, run_dir)),
+            ranks=ranks,
+            start=paths["start"],
+            further_labels=paths["further_labels"],
+            record=paths["record"],
+        )
 
 
 def _pseudo_labels(

@@ -30,6 +30,7 @@ from mtl_bench.cli import (
     score,
 )
 from mtl_bench.core.locks import CLAIMED, ClaimedError
+from mtl_bench.core.ranks import LostError
 
 TRACEBACK = "MTL_BENCH_TRACEBACK"  # set: errors come with their traceback
 # Threads that wait for each other give their core back soon: spinning long, one busy process beside
@@ -53,6 +54,9 @@ class Group(help.Group):
         except ClaimedError as error:
             typer.echo(f"mtl-bench: {error}", err=True)
             raise typer.Exit(CLAIMED) from None
+        except LostError as error:
+            typer.echo(f"mtl-bench: {error}", err=True)
+            raise typer.Exit(1) from None
         except SystemExit as stop:  # commands end by `typer.Exit`
             typer.echo(f"mtl-bench: a plug-in has called sys.exit({stop.code!r})", err=True)
             raise typer.Exit(1) from None

@@ -16,6 +16,7 @@ from mtl_bench.core.config import (
     override,
     set_values,
 )
+from mtl_bench.core.ranks import Processes, check_share, joined
 
 if TYPE_CHECKING:
     from mtl_bench.show.predict.cameras import Given
@@ -113,6 +114,7 @@ def train(
     camera_height: o.HeightOption = None,
     runs: o.RunsOption = Path("runs"),
     device: o.DeviceOption = o.Device.auto,
+    ranks: o.RanksOption = None,
     wandb: o.WandbOption = o.Wandb.off,
     plugins: o.PluginsOption = None,
     quiet: o.QuietOption = False,
@@ -121,61 +123,75 @@ def train(
 
     What it needs is run before: of --video the cell without it, of --single-task one for each task.
     Depth also trains on a plain video and its camera, --data VIDEO.mp4 --fx ...: nothing is
-    measured then, as there is no truth.
+    measured then, as there is no truth. The processes of torchrun, or of an srun of several tasks,
+    train the cell together, as with --ranks; see docs/clusters.md.
     """
-    if continued is not None:
-        named: dict[str, object] = {
-            **{"CELL.JSON": cell_file, "--backbone": backbone, "--method": method},
-            **{"--tasks": tasks, "--seed": seed, "--video": video, "--pretrained": pretrained},
-            **{"--single-task": single_task, "--recipe": recipe != "small"},
-            "--granularity": granularity != GRANULARITIES[0],
-        }
-        for option in (option for option, value in named.items() if value):
-            raise ValueError(f"{option} does not go with --continue, which takes RUN's: use --set")
-        cell = _continuing(continued, runs)
-    elif cell_file is not None:
-        from mtl_bench.bench.jobs import load_cell
+    with joined(ranks) as joint:
+        if isinstance(joint, Processes) and not joint.first:
+            from mtl_bench.bench.run import follow
 
-        cell = load_cell(cell_file)
-    else:
-        chosen = load_recipe(recipe)
-        backbone = backbone or chosen.backbone
-        if not backbone or method is None:
-            raise ValueError("say which cell: --backbone NAME and --method NAME, or a cell.json")
-        if tasks is not None and not o.names(tasks):
-            raise ValueError("a cell needs a task: --tasks NAME,NAME")
-        weights = o.weights(pretrained)
-        cell = Cell(
-            chosen,
-            backbone,
-            method,
-            o.names(tasks),
-            seed,
-            video=video,
-            single_task=single_task,
-            granularity=granularity,
-            pretrained=weights,
-        )
-    given = o.given_camera(camera, calib, (fx, fy, cx, cy), camera_height)
-    if data is not None and data.is_file():
-        cell, data = _filmed(cell, data, given, quiet)
-    elif given != type(given)():
-        raise ValueError("--camera, --calib, --fx ... are for --data VIDEO: a data set has its own")
-    cell = override(cell, settings or [])
-    if latency:
-        _time_again(cell, data, runs, device.value, quiet)
-        return
-    from mtl_bench.bench import launch, store
-    from mtl_bench.bench.data_state import Data
+            follow(joint, device.value)
+            return
+        if continued is not None:
+            named: dict[str, object] = {
+                **{"CELL.JSON": cell_file, "--backbone": backbone, "--method": method},
+                **{"--tasks": tasks, "--seed": seed, "--video": video, "--pretrained": pretrained},
+                **{"--single-task": single_task, "--recipe": recipe != "small"},
+                "--granularity": granularity != GRANULARITIES[0],
+            }
+            for option in (option for option, value in named.items() if value):
+                raise ValueError(
+                    f"{option} does not go with --continue, which takes RUN's: use --set"
+                )
+            cell = _continuing(continued, runs)
+        elif cell_file is not None:
+            from mtl_bench.bench.jobs import load_cell
 
-    check_cells([cell])
-    there = Data(o.locate(cell, data))
-    if not rerun and (line := store.done_already(cell, runs, stale, there)):
-        typer.echo(line)
-        return
-    root = o.data_root(cell, data, quiet)
-    here = launch.Here(runs, root, device.value, wandb.value, o.echo(quiet), there)
-    here.run(cell, rerun, stale)
+            cell = load_cell(cell_file)
+        else:
+            chosen = load_recipe(recipe)
+            backbone = backbone or chosen.backbone
+            if not backbone or method is None:
+                raise ValueError(
+                    "say which cell: --backbone NAME and --method NAME, or a cell.json"
+                )
+            if tasks is not None and not o.names(tasks):
+                raise ValueError("a cell needs a task: --tasks NAME,NAME")
+            weights = o.weights(pretrained)
+            cell = Cell(
+                chosen,
+                backbone,
+                method,
+                o.names(tasks),
+                seed,
+                video=video,
+                single_task=single_task,
+                granularity=granularity,
+                pretrained=weights,
+            )
+        given = o.given_camera(camera, calib, (fx, fy, cx, cy), camera_height)
+        if data is not None and data.is_file():
+            cell, data = _filmed(cell, data, given, quiet)
+        elif given != type(given)():
+            raise ValueError(
+                "--camera, --calib, --fx ... are for --data VIDEO: a data set has its own"
+            )
+        cell = override(cell, settings or [])
+        if latency:
+            _time_again(cell, data, runs, device.value, quiet)
+            return
+        from mtl_bench.bench import launch, store
+        from mtl_bench.bench.data_state import Data
+
+        check_cells([cell])
+        check_share(cell.recipe.optim, joint.size)
+        there = Data(o.locate(cell, data))
+        if not rerun and (line := store.done_already(cell, runs, stale, there)):
+            typer.echo(line)
+            return
+        root = o.data_root(cell, data, quiet)
+        here = launch.Here(runs, root, device.value, wandb.value, o.echo(quiet), there, joint)
+        here.run(cell, rerun, stale)
 
 
 def _filmed(cell: Cell, video: Path, given: "Given", quiet: bool) -> tuple[Cell, Path]:

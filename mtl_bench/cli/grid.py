@@ -16,6 +16,7 @@ import typer
 from mtl_bench.cli import options as o
 from mtl_bench.cli.queue import queue
 from mtl_bench.core.config import Cell
+from mtl_bench.core.ranks import check_share
 
 if TYPE_CHECKING:
     from mtl_bench.bench.data_state import Data
@@ -97,6 +98,7 @@ def ablate(
     runs: o.RunsOption = Path("runs"),
     reports: o.ReportsOption = Path("reports"),
     device: o.DeviceOption = o.Device.auto,
+    ranks: o.RanksOption = None,
     wandb: o.WandbOption = o.Wandb.off,
     plugins: o.PluginsOption = None,
     quiet: o.QuietOption = False,
@@ -119,6 +121,9 @@ def ablate(
     chosen = choice.load(device)
     if chosen.kind is not CELLS and (jobs or 1) > 1:
         raise ValueError(f"--jobs {jobs}: a latency is taken with nothing else of ours running")
+    each = ranks or 1
+    if chosen.kind is not CELLS and each > 1:
+        raise ValueError(f"--ranks {each}: ranks train, and this grid times networks")
     if chosen.kind is not CELLS and wandb is not o.Wandb.off:
         raise ValueError(f"--wandb {wandb.value}: a grid that times networks tracks no training")
     if where is On.slurm and chosen.kind is not CELLS:
@@ -128,6 +133,8 @@ def ablate(
     against = references.baselines(chosen)
     tried = [trial.cell for trial in tuning.trials(chosen)] if chosen.tune else []
     chosen.kind.check([*chosen.jobs, *against, *tried])
+    for job in (*chosen.jobs, *against, *tried) if each > 1 else ():
+        check_share(job.recipe.optim, each)
     if chosen.kind is CELLS and not dry_run:  # it imports pandas
         from mtl_bench.report import grid as of_cells
 
@@ -143,6 +150,7 @@ def ablate(
     steps = itertools.chain([first], (_left(each, runs, rerun, given) for each in phases))
     if where is On.slurm:
         passed_on = ["--wandb", wandb.value, "--device", device.value, *["--quiet"] * quiet]
+        passed_on += ["--ranks", str(each)] if each > 1 else []
         todo = next(filter(None, steps), [])
         queue(todo, runs, data, given, passed_on, sbatch, jobs, rerun, dry_run, quiet)
         if chosen.tune and todo and not dry_run:
@@ -152,13 +160,14 @@ def ablate(
         typer.echo("nothing was run (--dry-run)")
         return
     ran = False
-    gpus = _gpus(chosen, device)
+    gpus = _gpus(chosen, device, each)
     options = ["--wandb", wandb.value]
     for todo in steps:
         ran = ran or bool(todo)
         if todo:
-            several = jobs or _side_by_side(chosen, todo, gpus)
-            _run(chosen, todo, runs, data, given, options, device, several, gpus, rerun, quiet)
+            several = jobs or _side_by_side(chosen, todo, gpus, each)
+            place = (options, device, several, gpus, each)
+            _run(chosen, todo, runs, data, given, *place, rerun, quiet)
     if chosen.kind is CELLS:
         references.measure_trivial(
             chosen, runs, lambda: o.data_root(chosen.cells[0], data, quiet), refresh=ran
@@ -453,20 +462,22 @@ def _skipped(grid: "Grid") -> list[str]:
     return [f"  skipped {reasons.count(why)}: {why}" for why in dict.fromkeys(reasons)]
 
 
-def _gpus(grid: "Grid", device: o.Device) -> tuple[str, ...]:
-    """What cells are spread over; a timing takes the GPU that it would take in a terminal."""
+def _gpus(grid: "Grid", device: o.Device, each: int = 1) -> tuple[str, ...]:
+    """What cells are spread over, `each` a cell; a timing takes the GPU that it would take in a
+    terminal."""
     from mtl_bench.bench.jobs import CELLS
-    from mtl_bench.bench.launch import gpu_pool
+    from mtl_bench.bench.launch import gpu_pool, together
     from mtl_bench.core.device import choose_device
 
     if grid.kind is not CELLS or choose_device(device.value).type != "cuda":
         return ()
     import torch
 
-    return gpu_pool(os.environ.get("CUDA_VISIBLE_DEVICES"), torch.cuda.device_count())
+    pool = gpu_pool(os.environ.get("CUDA_VISIBLE_DEVICES"), torch.cuda.device_count())
+    return together(pool, each)
 
 
-def _side_by_side(grid: "Grid", todo: "Sequence[Job]", gpus: Sequence[str]) -> int:
+def _side_by_side(grid: "Grid", todo: "Sequence[Job]", gpus: Sequence[str], each: int = 1) -> int:
     """A cell a GPU. Without one a cell a core: two processes of one thread do more steps than one
     of two."""
     from mtl_bench.bench.jobs import CELLS, kind_of
@@ -475,7 +486,7 @@ def _side_by_side(grid: "Grid", todo: "Sequence[Job]", gpus: Sequence[str]) -> i
     if grid.kind is not CELLS:
         return 1
     trained = sum(kind_of(job).work(job) > 0 for job in todo) or 1
-    return min(len(gpus) or cores(), trained)
+    return min(len(gpus) or max(1, cores() // each), trained)
 
 
 def _run(
@@ -488,6 +499,7 @@ def _run(
     device: o.Device,
     jobs: int,
     gpus: Sequence[str],
+    each: int,
     rerun: str | None,
     quiet: bool,
 ) -> None:
@@ -499,6 +511,7 @@ def _run(
     cells = [job for job in todo if isinstance(job, Cell)]
     roots = {cell.recipe.data: o.data_root(cell, data, quiet) for cell in cells}
     passed_on = ["--device", device.value, *options, *(["--quiet"] if quiet else [])]
+    passed_on += ["--ranks", str(each)] if each > 1 else []
 
     def of_cell(cell: Cell) -> list[str]:
         return kinds.cell_command(cell, runs, roots[cell.recipe.data], passed_on)
@@ -511,7 +524,11 @@ def _run(
     names = _named(grid, runs)[1]
     with display.choose(len(todo), quiet, bars) as shown:
         launcher = Launcher(
-            runs, command, shown, jobs, rerun, names, smoke=grid.smoke, data=given, gpus=gpus
+            *(runs, command, shown, jobs, rerun, names),
+            smoke=grid.smoke,
+            data=given,
+            gpus=gpus,
+            ranks=each,
         )
         launcher.run(todo)
 

@@ -109,6 +109,20 @@ DeviceOption = Annotated[
     Device,
     typer.Option("--device", help="auto: CUDA where there is one.", rich_help_panel=RUNNING),
 ]
+RanksOption = Annotated[
+    int | None,
+    typer.Option(
+        "--ranks",
+        "--gpus-per-cell",
+        metavar="N",
+        min=1,
+        help="Processes that train a cell together, each some of the parts of a batch that "
+        "recipe.optim.micro_batch makes, and each on a GPU of its own where there are any. It "
+        "changes no number.",
+        rich_help_panel=RUNNING,
+        show_default=False,
+    ),
+]
 WandbOption = Annotated[
     Wandb, typer.Option("--wandb", help="Weights & Biases tracking.", rich_help_panel=RUNNING)
 ]

@@ -10,6 +10,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from mtl_bench.core.ranks import ALONE, Ranks
+
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
 
@@ -82,19 +84,39 @@ class Compute:
         self.scaler.update()
 
 
-def choose_device(name: str = "auto") -> torch.device:
-    """`auto`: CUDA where there is one. Otherwise a device by name.
+def choose_device(name: str = "auto", ranks: Ranks = ALONE) -> torch.device:
+    """`auto`: CUDA where there is one. Otherwise a device by name; of a rank its own GPU.
 
     Raises:
-        ValueError: CUDA where there is none, or an unknown device.
+        ValueError: CUDA where there is none, fewer GPUs than ranks, or an unknown device.
     """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.split(":")[0] not in ("cpu", "cuda"):
         raise ValueError(f"no device '{name}' (known: auto, cpu, cuda)")
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError("--device cuda, but torch sees no CUDA device here: use --device cpu")
+    if name == "cuda" and ranks.size > 1:
+        count = torch.cuda.device_count()
+        if 1 < count <= ranks.local:
+            raise ValueError(f"rank {ranks.rank} finds {count} GPUs here, one for each rank")
+        name = f"cuda:{ranks.local if count > 1 else 0}"  # a queue may show each its own alone
     return torch.device(name)
+
+
+@contextlib.contextmanager
+def drawing(seed: int | None, device: torch.device) -> Iterator[None]:
+    """What is drawn inside comes from the seed, and the generators are as before after it; None:
+    it comes from them."""
+    if seed is None:
+        yield
+        return
+    cuda = device.type == "cuda"
+    with torch.random.fork_rng(devices=[device] if cuda else []):
+        torch.default_generator.manual_seed(seed)
+        if cuda:
+            torch.cuda.manual_seed(seed)
+        yield
 
 
 @contextlib.contextmanager

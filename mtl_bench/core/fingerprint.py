@@ -35,7 +35,7 @@ HARNESS = "harness"
 EXCLUDED = {
     *("core.config", "core.recipe", "core.plain", "core.plugins", "core.provenance"),
     *("core.fingerprint", "core.columns", "core.quality", "core.files", "core.locks"),
-    *("core.declared", "core.scope", "core.toml_file", "core.canvas", "core.view"),
+    *("core.declared", "core.scope", "core.toml_file", "core.canvas", "core.view", "core.ranks"),
     *("train.progress", "train.tracking", "train.curve"),
     *("bench.jobs", "bench.store", "bench.data_state", "cli", "report", "show"),
 }

@@ -6,6 +6,7 @@ A run that starts at any step, in one process or several, therefore sees the sam
 
 import dataclasses
 import hashlib
+import math
 import signal
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
@@ -31,6 +32,7 @@ def train_batches(
     start_step: int = 0,
     workers: int = 0,
     pinned: bool = False,
+    share: tuple[int, int] = (0, 1),
 ) -> Iterator[Batch]:
     """Batches of step `start_step`, `start_step + 1`, ... without end.
 
@@ -43,6 +45,8 @@ def train_batches(
         start_step: the first batch to yield; how a stopped run goes on.
         workers: processes that prepare batches; they keep no decoded frames. 0: this one.
         pinned: with workers, batches in memory from which a GPU copies by itself.
+        share: which of how many equal shares of each batch's samples, of consecutive ones; the
+            workers are shared, too.
 
     Raises:
         ValueError: a batch larger than the split; while iterating, a broken file, or workers that
@@ -53,7 +57,8 @@ def train_batches(
             f"a batch of {batch_size} from {len(samples)} frames; set recipe.optim.batch to at "
             f"most that"
         )
-    steps = _Steps(len(samples), batch_size, seed, start_step)
+    steps = _Steps(len(samples), batch_size, seed, start_step, share)
+    workers = math.ceil(workers / share[1])
     if workers == 0:
         return (_batch(samples, slots) for slots in steps)
     return _from_workers(samples.uncached(), steps, workers, pinned)
@@ -176,11 +181,14 @@ def _one_thread(worker: int) -> None:
 
 
 class _Steps:
-    """Iterates over what each step's batch is made of, without end."""
+    """Iterates over what each step's batch, or a share of it, is made of, without end."""
 
-    def __init__(self, samples: int, batch_size: int, seed: int, start_step: int) -> None:
+    def __init__(
+        self, samples: int, batch_size: int, seed: int, start_step: int, share: tuple[int, int]
+    ) -> None:
         self.samples, self.batch_size, self.seed = samples, batch_size, seed
-        self.start_step = start_step
+        self.start_step, size = start_step, batch_size // share[1]
+        self.own = slice(share[0] * size, (share[0] + 1) * size)
 
     def __iter__(self) -> Iterator[list[Slot]]:
         step = self.start_step
@@ -188,9 +196,10 @@ class _Steps:
             epoch, position = divmod(step, self.samples // self.batch_size)
             first = position * self.batch_size
             indices = _order(self.samples, self.seed, epoch)[first : first + self.batch_size]
-            yield [
+            slots: list[Slot] = [
                 (index, ("augment", self.seed, step, slot)) for slot, index in enumerate(indices)
             ]
+            yield slots[self.own]
             step += 1
 
 

@@ -8,12 +8,12 @@ weighted pass goes on. A method that needs no more than a Gramian gets that, and
 
 Works under autocast; `scale` is the loss scale of fp16 training and is invisible to the method. A
 batch may come in parts: a method sees the mean of their losses and gradients, so that parts change
-what is in memory and not what a method decides.
+what is in memory and not what a method decides. Parts may be on several ranks, see `Together`: each
+is handed its own, and all decide alike.
 
 Shapes: T losses of the method, K of them in this batch, N independent batches, P shared parameters.
 """
 
-import contextlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,7 +35,6 @@ from mtl_bench.core.method import (
 from mtl_bench.core.terms import gather
 from mtl_bench.train.gramian import (
     KINDS,
-    Gradient,
     Gradients,
     Matrix,
     add,
@@ -48,6 +47,8 @@ from mtl_bench.train.gramian import (
 )
 from mtl_bench.train.perturbed import perturbed
 from mtl_bench.train.replay import GradientReplay
+from mtl_bench.train.statistics import frozen_statistics
+from mtl_bench.train.together import Gradient, Together
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class Pass:
 
 
 Forward = Callable[[], Pass]  # sends one part of a batch through the model
+ALONE = Together()
 
 
 class UnlabelledError(ValueError):
@@ -93,26 +95,28 @@ def backward(
     scale: float = 1.0,
     lr: float = 0.0,
     cosines: bool = False,
+    together: Together = ALONE,
 ) -> Weighting:
     """Fill `.grad` of the model's and the method's parameters.
 
     Args:
-        batches: `method.batches` of them, each in one part or more.
+        batches: `method.batches` of them, each in one part or more, those of this rank.
         scale: factor on all gradients.
         lr: learning rate of the shared parameters, for methods that look ahead.
         cosines: measure those between the tasks' gradients (loss-value methods: of the first part,
             at the cost of one backward pass per loss).
+        together: the ranks that have the other parts.
     """
     if isinstance(method, LossMethod):
-        return _by_losses(method, batches[0], model, scale, cosines)
+        return _by_losses(method, batches[0], model, scale, cosines, together)
     first, second = (
         (method.loss, method.gradient) if isinstance(method, Composed) else (None, method)
     )
     assert isinstance(second, GradientMethod)
-    step = _ByGradients(first, second, model, scale)
+    step = _ByGradients(first, second, model, scale, together)
     if isinstance(second, PerturbedMethod):
         shared = trainable(model.shared_parameters())
-        with perturbed(second, batches[0], shared, frozen_statistics(model)) as parts:
+        with perturbed(second, batches[0], shared, model, together) as parts:
             return step.on_one_batch([parts], lr, cosines)
     if isinstance(second, GradientReplay):
         return step.by_given_weights(batches[0], second.weights_HT, cosines)
@@ -121,12 +125,18 @@ def backward(
     return step.on_one_batch(batches, lr, cosines)
 
 
-def reevaluate(method: Method, step: Step, parts: Sequence[Forward], model: Split) -> None:
+def reevaluate(
+    method: Method,
+    step: Step,
+    parts: Sequence[Forward],
+    model: Split,
+    together: Together = ALONE,
+) -> None:
     """Tell a method that asks for it what the batch's losses are after its step.
 
     A step may move a term's last pixel out of view: the method then hears nothing of that term.
     """
-    after = _mine(method, losses_of(parts, model))
+    after = _mine(method, losses_of(parts, model, together))
     names = _names_of(method, step)
     kept = [index for index, name in enumerate(names) if name in after]
     if kept:
@@ -164,22 +174,24 @@ def mean_losses(parts: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.stack(values).mean(0) for name, values in found.items()}
 
 
-def losses_of(parts: Sequence[Forward], model: Split) -> list[Mapping[str, Tensor]]:
-    """Each part's loss terms under the present parameters; leaves no trace in the model."""
+def losses_of(
+    parts: Sequence[Forward], model: Split, together: Together = ALONE
+) -> Sequence[Mapping[str, Tensor]]:
+    """Every part's loss terms under the present parameters; leaves no trace in the model."""
     with torch.no_grad(), frozen_statistics(model):
-        return [part().losses for part in parts]
+        return together.losses([part().losses for part in parts])
 
 
 def _looked_at(
-    method: Method, parts: Sequence[Forward], model: Split
-) -> tuple[list[Mapping[str, Tensor]], Counter[str], Iterator[Pass]]:
-    """The parts' losses, in how many of them the method has each, and then their passes.
+    method: Method, parts: Sequence[Forward], model: Split, together: Together
+) -> tuple[Sequence[Mapping[str, Tensor]], Counter[str], Iterator[Pass]]:
+    """All parts' losses, in how many of them the method has each, and then this rank's passes.
 
     Weights may depend on all losses, so a batch in several parts is run twice: for its losses, and
     for its gradients once the weights are known.
     """
-    single = [parts[0]()] if len(parts) == 1 else []
-    seen = [passed.losses for passed in single] or losses_of(parts, model)
+    single = [parts[0]()] if len(parts) == together.ranks.size == 1 else []
+    seen = together.losses([single[0].losses]) if single else losses_of(parts, model, together)
     count = Counter(name for losses in seen for name in gather(losses, method.terms))
     return seen, count, (single.pop() if single else part() for part in parts)
 
@@ -215,22 +227,30 @@ def _weighting(
 
 
 def _by_losses(
-    method: LossMethod, parts: Sequence[Forward], model: Split, scale: float, cosines: bool
+    method: LossMethod,
+    parts: Sequence[Forward],
+    model: Split,
+    scale: float,
+    cosines: bool,
+    together: Together,
 ) -> Weighting:
     """The weights are the derivatives of the method's scalar."""
-    seen, count, passes = _looked_at(method, parts, model)
+    seen, count, passes = _looked_at(method, parts, model, together)
     step = _step_of(method, seen)
     total, scaled_K = _differentiate(method, step, scale)
+    scaled_K = together.first(scaled_K)
     cosine_of: dict[str, float] = {}
     scaled = dict(zip(_names_of(method, step), scaled_K, strict=True))
-    for number, passed in enumerate(passes):
-        mine = gather(passed.losses, method.terms)
-        if not mine:
-            continue
-        if cosines and number == 0:
-            cosine_of = _measured(mine, _trained(passed), model)
-        grads = [scaled[name] / count[name] for name in mine]
-        torch.autograd.backward(list(mine.values()), grads)
+    with together.statistics(model):
+        for number, passed in enumerate(passes):
+            mine = gather(passed.losses, method.terms)
+            if not mine:
+                continue
+            if cosines and number == 0:
+                cosine_of = _measured(mine, _trained(passed), model)
+            grads = [scaled[name] / count[name] for name in mine]
+            torch.autograd.backward(list(mine.values()), grads)
+    together.grads([*trainable(model.shared_parameters()), *trainable(model.task_parameters())])
     return _weighting(method, mean_losses(seen), step, scaled_K / scale, cosine_of, total)
 
 
@@ -249,7 +269,7 @@ def _measured(losses: Mapping[str, Tensor], z: list[Tensor], model: Split) -> di
     for loss in losses.values():
         z_grads = torch.autograd.grad(loss, z, retain_graph=True, allow_unused=True)
         rows.append(onward(z, z_grads, shared, keep=True))
-    return cosines_of(list(losses), rows)
+    return cosines_of(list(losses), products(rows, rows))
 
 
 # --- gradient methods -----------------------------------------------------------------------------
@@ -271,9 +291,15 @@ class _ByGradients:
     """A gradient method's step, behind a loss-value method where two are composed."""
 
     def __init__(
-        self, first: LossMethod | None, method: GradientMethod, model: Split, scale: float
+        self,
+        first: LossMethod | None,
+        method: GradientMethod,
+        model: Split,
+        scale: float,
+        together: Together,
     ):
         self.first, self.method, self.model, self.scale = first, method, model, scale
+        self.together = together
         self.terms = [term.name for term in method.terms]
         self.shared = trainable(model.shared_parameters())
         self.own = trainable(model.task_parameters())
@@ -284,7 +310,9 @@ class _ByGradients:
         """Every loss's gradient, then the method's answer."""
         seen = self._differentiated(batches[0], self.scale, self.own)
         first_K, step = self._first(seen.step)
-        measured = cosines_of(seen.names, seen.rows) if cosines else {}
+        measured = {}
+        if cosines:
+            measured = cosines_of(seen.names, seen.gradients.products(seen.rows))
         if isinstance(seen.gradients, Matrix):
             J_KP = seen.gradients.J_KP
             if self.first is not None:
@@ -292,7 +320,7 @@ class _ByGradients:
             direction_P, weight_K = self._direction(J_KP, first_K, step, batches, lr)
             seen.gradients.back(unflatten(direction_P * self.scale, self.shared))
         else:
-            weight_K = self._weights(products(seen.rows, seen.rows), first_K, step)
+            weight_K = self._weights(seen.gradients.products(seen.rows), first_K, step)
             seen.gradients.back(combine(first_K * weight_K * self.scale, seen.rows))
         head_K = first_K * self._head_weights(weight_K, step)
         self._add_own(seen.own, seen.names, head_K)
@@ -325,7 +353,7 @@ class _ByGradients:
         loss_K, other_K = (one.step.loss_K[place] for one, place in zip(seen, places, strict=True))
         plain = Step((loss_K + other_K) / 2, seen[0].step.present[places[0]])
         first_K, step = self._first(plain)
-        measured = cosines_of(names, rows[0]) if cosines else {}
+        measured = cosines_of(names, products(rows[0], rows[0])) if cosines else {}
         weight_K = self._weights(products(*rows), first_K, step)
         head_K = first_K * self._head_weights(weight_K, step)
         del seen, rows  # as large as the network, many times
@@ -337,7 +365,7 @@ class _ByGradients:
         """A composition's loss-value method is asked first: its weights, and the step by them."""
         if self.first is None:
             return torch.ones_like(step.loss_K), step
-        first_K = _differentiate(self.first, step, self.scale)[1] / self.scale
+        first_K = self.together.first(_differentiate(self.first, step, self.scale)[1] / self.scale)
         return first_K, replace(step, loss_K=first_K * step.loss_K)
 
     def _weights(self, G_KK: Tensor, first_K: Tensor, step: Step) -> Tensor:
@@ -346,7 +374,8 @@ class _ByGradients:
             return torch.ones_like(step.loss_K)
         scale_K = first_K.double().cpu()
         exact = replace(step, loss_K=step.loss_K.double().cpu())
-        return self.method.weights(G_KK * scale_K * scale_K[:, None], exact).to(step.loss_K)
+        weight_K = self.method.weights(G_KK * scale_K * scale_K[:, None], exact)
+        return self.together.first(weight_K.to(step.loss_K))
 
     def _direction(
         self,
@@ -388,7 +417,7 @@ class _ByGradients:
     def _head_weights(self, weight_K: Tensor, step: Step) -> Tensor:
         if not self.method.weighted_heads:
             return torch.ones_like(weight_K)
-        return self.method.head_weights(weight_K, step)
+        return self.together.first(self.method.head_weights(weight_K, step))
 
     def _differentiated(
         self, parts: Sequence[Forward], scale: float, own: Sequence[nn.Parameter]
@@ -400,22 +429,24 @@ class _ByGradients:
                 it, those of `own` are not.
             own: parameters that are not shared, whose gradients are wanted.
         """
-        gradients = KINDS[self.method.needs](self.shared, self.terms)
+        gradients = KINDS[self.method.needs](self.shared, self.terms, self.together)
         own_of: dict[str, list[Tensor | None]] = {}
-        count: Counter[str] = Counter()
-        looked_at = []
-        for part in parts:
-            passed = part()
-            looked_at.append({name: loss.detach() for name, loss in passed.losses.items()})
-            mine, z = gather(passed.losses, self.method.terms), _trained(passed)
-            del passed  # which holds the losses, too
-            count.update(mine.keys())
-            gradients.add(z, _through_decoders(mine, z, own, own_of, scale))
-        step = _step_of(self.method, looked_at)
+        looked_at: list[Mapping[str, Tensor]] = []
+        with self.together.statistics(self.model):
+            for part in parts:
+                passed = part()
+                looked_at.append({name: loss.detach() for name, loss in passed.losses.items()})
+                mine, z = gather(passed.losses, self.method.terms), _trained(passed)
+                del passed  # which holds the losses, too
+                gradients.add(z, _through_decoders(mine, z, own, own_of, scale))
+        seen = self.together.losses(looked_at)
+        step = _step_of(self.method, seen)
         names = _names_of(self.method, step)
+        count = Counter(name for losses in seen for name in gather(losses, self.method.terms))
         rows = gradients.mean({name: scale * count[name] for name in names})
+        own_of = self.together.rows(names, own_of, own)
         means = {name: divided(own_of[name], count[name]) for name in names}
-        return _Seen(mean_losses(looked_at), step, names, rows, gradients, means)
+        return _Seen(mean_losses(seen), step, names, rows, gradients, means)
 
     def _weighted_pass(
         self,
@@ -424,35 +455,37 @@ class _ByGradients:
         weight_K: Tensor,
         head_K: Tensor,
         cosines: bool = False,
-    ) -> tuple[list[Mapping[str, Tensor]], dict[str, float]]:
+    ) -> tuple[Sequence[Mapping[str, Tensor]], dict[str, float]]:
         """`.grad` of a batch whose losses count `weight` in what is shared, and `head` in the rest.
 
         Losses without a name here are left out.
 
         Returns:
-            Each part's losses, and cosines of the first one's gradients where they are asked for.
+            All parts' losses, and cosines of the first one's gradients where they are asked for.
         """
-        seen, count, passes = _looked_at(self.method, parts, self.model)
+        seen, count, passes = _looked_at(self.method, parts, self.model, self.together)
         factors = [self.scale / max(count[name], 1) for name in names]
         factor_K = torch.tensor(factors).to(weight_K)
         own_of: dict[str, list[Tensor | None]] = {}
         total: list[Tensor | None] = [None] * len(self.shared)
         measured: dict[str, float] = {}
-        for number, passed in enumerate(passes):
-            mine, z = gather(passed.losses, self.method.terms), _trained(passed)
-            mine = {name: loss for name, loss in mine.items() if name in names}
-            del passed
-            if not mine:
-                continue
-            if cosines and number == 0:
-                measured = _measured(mine, z, self.model)
-            z_grads = _through_decoders(mine, z, self.own, own_of, 1.0)
-            here = [names.index(name) for name in z_grads]
-            weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))
-            total = add(total, onward(z, weighted, self.shared, keep=False))
+        with self.together.statistics(self.model):
+            for number, passed in enumerate(passes):
+                mine, z = gather(passed.losses, self.method.terms), _trained(passed)
+                mine = {name: loss for name, loss in mine.items() if name in names}
+                del passed
+                if not mine:
+                    continue
+                if cosines and number == 0:
+                    measured = _measured(mine, z, self.model)
+                z_grads = _through_decoders(mine, z, self.own, own_of, 1.0)
+                here = [names.index(name) for name in z_grads]
+                weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))
+                total = add(total, onward(z, weighted, self.shared, keep=False))
         for parameter, grad in zip(self.shared, total, strict=True):
             parameter.grad = grad
-        self._add_own(own_of, names, head_K * factor_K)
+        self.together.grads(self.shared)
+        self._add_own(self.together.rows(names, own_of, self.own), names, head_K * factor_K)
         return seen, measured
 
     def _add_own(
@@ -490,23 +523,6 @@ def _through_decoders(
         found[name] = grads[: len(z)]
         own_of[name] = add(own_of.get(name), grads[len(z) :])
     return found
-
-
-# --- the model ------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def frozen_statistics(model: Split) -> Iterator[None]:
-    """Training mode whose batch norms leave their running statistics alone."""
-    norms = [m for m in model.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
-    tracked = [m.track_running_stats for m in norms]
-    for norm in norms:
-        norm.track_running_stats = False
-    try:
-        yield
-    finally:
-        for norm, value in zip(norms, tracked, strict=True):
-            norm.track_running_stats = value
 
 
 def trainable(parameters: Iterator[nn.Parameter]) -> list[nn.Parameter]:

@@ -38,7 +38,7 @@ class Curve:
             writer.writerows(kept)
         write_text(path, text.getvalue())
         self._empty = not kept
-        self._file = path.open("a", newline="")
+        self._file: io.TextIOBase = path.open("a", newline="")
 
     def append(self, row: Mapping[str, float | None]) -> None:
         """Every row has the same keys; None leaves its place empty."""
@@ -63,6 +63,16 @@ class Curve:
         trace: TracebackType | None,
     ) -> None:
         self._file.close()
+
+
+class Unwritten(Curve):
+    """Of a rank that writes nothing."""
+
+    def __init__(self) -> None:
+        self._file = io.StringIO()
+
+    def append(self, row: Mapping[str, float | None]) -> None:
+        """Rank 0 writes it."""
 
 
 def _text(key: str, value: float | None) -> str:

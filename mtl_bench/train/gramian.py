@@ -13,7 +13,8 @@ from itertools import combinations, pairwise
 import torch
 from torch import Tensor, nn
 
-Gradient = Sequence[Tensor | None]  # in the order of the space's tensors
+from mtl_bench.train.together import Gradient, Together
+
 CPU_CHUNK = 2**14  # numbers of a gradient at once: those of K gradients stay in a core's cache
 
 
@@ -73,9 +74,8 @@ def divided(grads: Gradient, by: float) -> list[Tensor | None]:
     return list(grads) if by == 1 else [g if g is None else g / by for g in grads]
 
 
-def cosines_of(names: Sequence[str], rows: Sequence[Gradient]) -> dict[str, float]:
-    """Of every pair of gradients; 0 with one that is zero."""
-    G_KK = products(rows, rows)
+def cosines_of(names: Sequence[str], G_KK: Tensor) -> dict[str, float]:
+    """Of every pair of gradients, from their products; 0 with one that is zero."""
     norm_K = G_KK.diagonal().clamp_min(0).sqrt()
     cosine_KK = G_KK / (norm_K * norm_K[:, None]).clamp_min(torch.finfo(torch.float64).tiny)
     pairs = combinations(range(len(names)), 2)
@@ -99,10 +99,10 @@ def unflatten(vector_P: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
 
 
 class Gradients:
-    """Gradients of the shared parameters, added up over the parts of a batch."""
+    """Gradients of the shared parameters, added up over a batch's parts, those of all ranks."""
 
-    def __init__(self, shared: Sequence[nn.Parameter], terms: Sequence[str]):
-        self.shared, self.terms = shared, terms
+    def __init__(self, shared: Sequence[nn.Parameter], terms: Sequence[str], together: Together):
+        self.shared, self.terms, self.together = shared, terms, together
         self.rows: dict[str, list[Tensor | None]] = {}
 
     def add(self, z: Sequence[Tensor], z_grads: dict[str, Gradient]) -> None:
@@ -115,7 +115,12 @@ class Gradients:
         self.rows[name] = add(self.rows.get(name), grads)
 
     def mean(self, divisor_of: Mapping[str, float]) -> list[list[Tensor | None]]:
+        self.rows = self.together.rows([*divisor_of], self.rows, self.shared)
         return [divided(self.rows[name], by) for name, by in divisor_of.items()]
+
+    def products(self, rows: Sequence[Gradient]) -> Tensor:
+        """Inner products [K,K] of all ranks' gradients."""
+        return products(rows, rows)
 
     def back(self, direction: Gradient) -> None:
         """A direction, as a row has it, into `.grad`."""
@@ -128,16 +133,23 @@ class Matrix(Gradients):
 
     def put(self, name: str, grads: Gradient) -> None:
         if not self.rows:  # not before: the decoders need memory, too
-            P = sum(parameter.numel() for parameter in self.shared)
-            self.J_TP = torch.zeros(len(self.terms), P, device=self.shared[0].device)
+            self.J_TP = self._nothing()
         row_P = self.J_TP[self.terms.index(name)]
         if name in self.rows:
             row_P += flatten(grads, self.shared)
         else:
             self.rows[name] = [flatten(grads, self.shared, out=row_P)]
 
+    def _nothing(self) -> Tensor:
+        P = sum(parameter.numel() for parameter in self.shared)
+        return torch.zeros(len(self.terms), P, device=self.shared[0].device)
+
     def mean(self, divisor_of: Mapping[str, float]) -> list[list[Tensor | None]]:
+        if not self.rows:  # all of these losses are other ranks'
+            self.J_TP = self._nothing()
         here = [self.terms.index(name) for name in divisor_of]
+        for index in here:
+            self.together.ranks.sum_(self.J_TP[index])
         self.J_KP = self.J_TP if len(here) == len(self.J_TP) else self.J_TP[here]
         for row_P, divisor in zip(self.J_KP, divisor_of.values(), strict=True):
             if divisor != 1:
@@ -148,8 +160,8 @@ class Matrix(Gradients):
 class AtRepresentation(Gradients):
     """Gradients of what the decoders read: the parts' tensors stand side by side."""
 
-    def __init__(self, shared: Sequence[nn.Parameter], terms: Sequence[str]):
-        super().__init__(shared, terms)
+    def __init__(self, shared: Sequence[nn.Parameter], terms: Sequence[str], together: Together):
+        super().__init__(shared, terms, together)
         self.rows = {name: [] for name in terms}
         self.read: list[Tensor] = []
 
@@ -158,10 +170,19 @@ class AtRepresentation(Gradients):
         for name, row in self.rows.items():
             row += z_grads.get(name, [None] * len(z))
 
+    def mean(self, divisor_of: Mapping[str, float]) -> list[list[Tensor | None]]:
+        return [divided(self.rows[name], by) for name, by in divisor_of.items()]
+
+    def products(self, rows: Sequence[Gradient]) -> Tensor:
+        return self.together.ranks.sum_(super().products(rows))
+
     def back(self, direction: Gradient) -> None:
         super().back(onward(self.read, direction, self.shared, keep=False))
+        self.together.grads(self.shared)
 
 
+# What ranks add to each other's: what one reads is its own, so that only products and the update
+# of the representation have a sum.
 KINDS = {"gramian": Gradients, "jacobian": Matrix, "representation": AtRepresentation}
 
 

@@ -3,7 +3,7 @@
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -12,19 +12,21 @@ from torch import Tensor, nn
 
 from mtl_bench.core.batch import Batch
 from mtl_bench.core.config import Cell, Optim
-from mtl_bench.core.device import Compute, initial_weights, seed_for
+from mtl_bench.core.device import Compute, drawing, initial_weights, seed_for
 from mtl_bench.core.method import LossMethod, Method, Step
+from mtl_bench.core.ranks import ALONE, Ranks, check_share
 from mtl_bench.core.task import Task, tasks_of_cell, terms_of
 from mtl_bench.core.terms import Term
 from mtl_bench.data.loader import train_batches
 from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model, build_model
 from mtl_bench.train import checkpoint
-from mtl_bench.train.backward import Pass, UnlabelledError, Weighting, backward, reevaluate
+from mtl_bench.train.backward import Forward, Pass, UnlabelledError, Weighting, backward, reevaluate
 from mtl_bench.train.compose import compose
-from mtl_bench.train.curve import Curve
+from mtl_bench.train.curve import Curve, Unwritten
 from mtl_bench.train.progress import Interrupted, Pace, Progress
 from mtl_bench.train.replay import Replay, replay_of
+from mtl_bench.train.together import Together
 from mtl_bench.train.tracking import Tracker
 
 CHECKPOINT = "last.pt"
@@ -39,6 +41,7 @@ def train(
     progress: Progress,
     tracker: Tracker,
     *,
+    ranks: Ranks = ALONE,
     start: Path | None = None,
     further_labels: Path | None = None,
     record: Path | None = None,
@@ -46,8 +49,11 @@ def train(
 ) -> Model:
     """Train a cell to its last step, from its own checkpoint where there is one.
 
+    On several ranks each calls this, and rank 0 alone writes.
+
     Args:
         root: the data set.
+        ranks: those that share the parts of every batch.
         run_dir: where `last.pt` and `curve.csv` are kept.
         start: checkpoint whose model and method a fresh run goes on from; optimiser and learning
             rate begin anew.
@@ -63,16 +69,18 @@ def train(
         Interrupted: a signal asked to stop; the state is saved.
     """
     optim = cell.recipe.optim
+    check_share(optim, ranks.size)
     model, method, optimizer = build(cell, compute)
     path, step = run_dir / CHECKPOINT, 0
     if isinstance(method, Replay):
         assert record is not None
         assert cell.replay is not None
         method.take(record, optim.steps, cell.replay, seed_for(cell.seed, "replay"))
-    if rehearse is not None and not path.is_file():
+    begun = ranks.from_first(path.is_file())
+    if rehearse is not None and not begun:
         rehearse(model)
     torch.manual_seed(seed_for(cell.seed, "training"))  # what a plug-in may draw, such as dropout
-    if path.is_file():
+    if begun:
         step = checkpoint.restore(path, cell, model, method, optimizer, compute.scaler)
         progress.say(f"continuing at step {step} of {optim.steps}")
     elif start is not None:
@@ -85,33 +93,49 @@ def train(
         task.begin(samples.dataset)
     data_seed, first = seed_for(cell.seed, "data"), step * method.batches
     workers = cell.recipe.data.workers
-    batches = train_batches(samples, optim.batch, data_seed, first, workers, compute.pinned)
+    share = ranks.rank, ranks.size
+    batches = train_batches(samples, optim.batch, data_seed, first, workers, compute.pinned, share)
     clipped: list[Tensor] = list(model.parameters())
     model.train()
 
     def save() -> None:
         check_state(model, method, optimizer, cell.method, step)
-        curve.flush()  # first: the rows up to a checkpoint's step must never be missing
-        checkpoint.save(path, step, model, method, optimizer, compute.scaler, cell)
+        check_equal(model, ranks, step)
+        if ranks.first:
+            curve.flush()  # first: the rows up to a checkpoint's step must never be missing
+            checkpoint.save(path, step, model, method, optimizer, compute.scaler, cell)
 
-    def forward(part: Batch) -> Pass:
-        with compute.autocast():
-            outputs = model(part)
-        losses = model.losses(outputs, part)
+    def forward(part: Batch, seed: int | None) -> Pass:
+        with drawing(seed, compute.device):
+            with compute.autocast():
+                outputs = model(part)
+            return Pass(model.losses(outputs, part), outputs.representation)
+
+    def parts_of(batch: Batch, number: int) -> list[Forward]:
+        """This rank's parts. Each of several draws what it draws from a seed of its own."""
+        split = batch.split(optim.micro_batch or optim.batch)
+        several, before = len(split) * ranks.size > 1, len(split) * ranks.rank
+        return [
+            partial(
+                forward,
+                part.to(compute.device, compute.channels_last),
+                seed_for(cell.seed, f"batch {number} part {index}") if several else None,
+            )
+            for index, part in enumerate(split, before)
+        ]
+
+    def check(losses: Mapping[str, Tensor]) -> None:
         check_finite(losses, step)
-        return Pass(losses, outputs.representation)
 
+    together = Together(ranks, check, compute.device)
     pace = Pace()
-    with Curve(run_dir / "curve.csv", step) as curve:
+    with Curve(run_dir / "curve.csv", step) if ranks.first else Unwritten() as curve:
         while step < optim.steps:
             step_start = time.perf_counter()
             lr_factor = set_learning_rate(optimizer, optim, step)
             drawn = [next(batches) for _ in range(method.batches)]
             data_ms = 1000 * (time.perf_counter() - step_start)
-            parts = [
-                [partial(forward, part.to(compute.device, compute.channels_last)) for part in split]
-                for split in (batch.split(optim.micro_batch or optim.batch) for batch in drawn)
-            ]
+            parts = [parts_of(batch, step * method.batches + n) for n, batch in enumerate(drawn)]
             optimizer.zero_grad(set_to_none=True)
             weighting, update_norm, grad_norm = NOTHING, 0.0, 0.0
             if isinstance(method, Replay):
@@ -124,6 +148,7 @@ def train(
                     scale=compute.scaler.get_scale(),
                     lr=optimizer.param_groups[0]["lr"],
                     cosines=bool(optim.cosine_every) and step % optim.cosine_every == 0,
+                    together=together,
                 )
             except UnlabelledError:
                 if step == 0:  # rather a folder without labels than an unlucky crop
@@ -137,7 +162,7 @@ def train(
                     check_gradients(norms, cell.method, step)
                 compute.apply(optimizer)
                 if method.reevaluates:
-                    reevaluate(method, weighting.step, parts[0], model)
+                    reevaluate(method, weighting.step, parts[0], model, together)
             step += 1
 
             row = describe_step(weighting, method, model.tasks, bool(optim.cosine_every))
@@ -149,9 +174,10 @@ def train(
             progress.update("train", step, optim.steps, f"loss {weighting.total:.3f}")
             if slow := pace.note(step_ms, data_ms):
                 progress.say(slow)
-            if step % optim.checkpoint_every == 0 or step == optim.steps or progress.stop_asked:
+            stop = ranks.any(progress.stop_asked)
+            if step % optim.checkpoint_every == 0 or step == optim.steps or stop:
                 save()
-            if progress.stop_asked:
+            if stop:
                 raise Interrupted(f"stopped at step {step} of {optim.steps}, saved in {path}")
     return model
 
@@ -204,7 +230,23 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, optim: Optim, step: int)
     return factor
 
 
-def check_finite(losses: dict[str, Tensor], step: int) -> None:
+def check_equal(model: nn.Module, ranks: Ranks, step: int) -> None:
+    """Raise where the ranks' models differ: what was not made of the same numbers drifts apart."""
+    if ranks.size == 1:
+        return
+    state = model.state_dict()
+    sums = [value.double().sum().item() for value in state.values()]
+    for rank, others in enumerate(ranks.gather(sums)):
+        for key, own, other in zip(state, sums, others, strict=True):
+            if own != other:
+                raise ValueError(
+                    f"'{key}' differs between ranks {ranks.rank} and {rank} after step {step}, by "
+                    f"{abs(own - other):.3g} in sum: run them on processors of one kind; or a "
+                    f"module changes it in its forward pass, which only batch norms may"
+                )
+
+
+def check_finite(losses: Mapping[str, Tensor], step: int) -> None:
     for name, loss in losses.items():
         if not torch.isfinite(loss):
             raise FloatingPointError(

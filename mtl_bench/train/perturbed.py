@@ -8,8 +8,7 @@ Shapes: K losses of the batch.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,9 +18,11 @@ from torch import Tensor, nn
 from mtl_bench.core.method import PerturbedMethod, Step
 from mtl_bench.core.terms import Term, gather
 from mtl_bench.train.gramian import add
+from mtl_bench.train.statistics import frozen_statistics
+from mtl_bench.train.together import Together
 
 if TYPE_CHECKING:
-    from mtl_bench.train.backward import Forward, Pass
+    from mtl_bench.train.backward import Forward, Pass, Split
 
 
 @contextlib.contextmanager
@@ -29,25 +30,29 @@ def perturbed(
     method: PerturbedMethod,
     parts: "Sequence[Forward]",
     shared: Sequence[nn.Parameter],
-    frozen: AbstractContextManager[None],
+    model: "Split",
+    together: Together,
 ) -> "Iterator[list[Forward]]":
     """Parts to differentiate in place of the given ones, one a loss and part, in their order.
 
     Args:
         shared: what is moved.
-        frozen: the model leaves its running statistics alone inside of it.
     """
     values: list[dict[str, Tensor]] = []  # by part, of the terms that it has
     mean: list[Tensor | None] | None = None
-    for part in parts:
-        mine = gather(part().losses, method.terms)
-        values.append({name: loss.detach() for name, loss in mine.items()})
-        if mine:
-            total = torch.stack(list(mine.values())).sum()
-            mean = add(mean, torch.autograd.grad(total, shared, allow_unused=True))
-    if mean is None:  # no labels at all: not for this module to say
+    with together.statistics(model):
+        for part in parts:
+            mine = gather(part().losses, method.terms)
+            values.append({name: loss.detach() for name, loss in mine.items()})
+            if mine:
+                total = torch.stack(list(mine.values())).sum()
+                mean = add(mean, torch.autograd.grad(total, shared, allow_unused=True))
+    everywhere = together.losses(values)
+    present = [term for term in method.terms if any(term.name in part for part in everywhere)]
+    if not present:  # no labels at all: not for this module to say
         yield list(parts)
         return
+    mean = together.rows(["mean"], {} if mean is None else {"mean": mean}, shared)["mean"]
     before = [parameter.detach().clone() for parameter in shared]
 
     def move(shift: Sequence[Tensor] | None) -> None:
@@ -59,12 +64,11 @@ def perturbed(
         move(shift)
         with torch.no_grad():
             found = [gather(part().losses, method.terms) for part in parts]
-        return _means(found, [method.terms[i] for i in step.present.tolist()])
+        return _means(together.losses(found), present)
 
-    present = [term for term in method.terms if any(term.name in own for own in values)]
     indices = torch.tensor([i for i, term in enumerate(method.terms) if term in present])
-    step = Step(_means(values, present), indices)
-    with frozen:
+    step = Step(_means(everywhere, present), indices)
+    with frozen_statistics(model):
         shifts = method.shifts(mean, losses_at, step)
         try:
             yield [
@@ -77,7 +81,7 @@ def perturbed(
             move(None)
 
 
-def _means(parts: Sequence[dict[str, Tensor]], terms: Sequence[Term]) -> Tensor:
+def _means(parts: Sequence[Mapping[str, Tensor]], terms: Sequence[Term]) -> Tensor:
     of = [[part[term.name] for part in parts if term.name in part] for term in terms]
     return torch.stack([torch.stack(values).mean() for values in of]).detach()
 

@@ -64,6 +64,16 @@ class Progress:
             file.write(json.dumps(state).encode())
 
 
+class Listening(Progress):
+    """Of a rank behind the first: it writes and says nothing, and knows whether a signal came."""
+
+    def say(self, line: str) -> None:
+        """Rank 0 says it."""
+
+    def update(self, stage: str, step: int, steps: int, note: str = "") -> None:
+        """Rank 0 writes it."""
+
+
 class Pace:
     """Notices, once, that steps take far longer than the first ones, and tells why."""
 

@@ -357,7 +357,7 @@ def train(tmp_path, monkeypatch):
     module = types.ModuleType("mtl_bench.bench.run")
     seen = []
 
-    def run_cell(cell, directory, root, device, wandb, echo):
+    def run_cell(cell, directory, root, device, wandb, echo, ranks):
         seen.append((cell, device, wandb))
         run.behave(directory)
         write_json(

@@ -5,11 +5,13 @@ Shapes: T losses, P shared parameters.
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from mtl_bench.bench.check.side_by_side import side_by_side
 from mtl_bench.bench.space import of_method
 from mtl_bench.core import plugins
 from mtl_bench.core.method import (
@@ -21,7 +23,8 @@ from mtl_bench.core.method import (
     Step,
 )
 from mtl_bench.core.terms import Term
-from mtl_bench.train.backward import Pass, Weighting, backward, reevaluate
+from mtl_bench.train.backward import ALONE, Pass, Weighting, backward, reevaluate
+from mtl_bench.train.together import Together
 
 LOSSES = (  # of two tasks, with weights as far apart as real ones
     Term("a", "first", "classification", 1.0),
@@ -54,13 +57,15 @@ class Quadratics(nn.Module):
     def task_parameters(self) -> Iterator[nn.Parameter]:
         yield from self.own.values()
 
-    def forward(self) -> Pass:
+    def forward(self, number: int = 0) -> Pass:
+        """Of a batch's part: in each the bowls are a little further, and it lacks as many losses as
+        there were parts before it."""
         read = self.shared.view_as(self.shared)
         losses = {
-            term.name: (read - self.target[term.name]).square().mean()
+            term.name: (read - self.target[term.name] - 0.1 * number).square().mean()
             + self.own[term.name].square()
             + 0.1
-            for term in self.terms
+            for term in self.terms[: len(self.terms) - number]
         }
         return Pass(losses, [read])
 
@@ -69,20 +74,30 @@ class Quadratics(nn.Module):
         return [float((self.shared - x).detach().square().mean()) for x in self.target.values()]
 
 
-def step_toy(method: Method, toy: Quadratics, scale: float = 1.0) -> Weighting:
-    """One step of gradient descent, of a length that no method can make explode."""
+def step_toy(
+    method: Method,
+    toy: Quadratics,
+    scale: float = 1.0,
+    numbers: Sequence[int] = (0,),
+    together: Together = ALONE,
+) -> Weighting:
+    """One step of gradient descent, of a length that no method can make explode.
+
+    Args:
+        numbers: of the batch's parts.
+    """
     parameters = [*toy.parameters(), *method.parameters()]
     for parameter in parameters:
         parameter.grad = None
-    parts = [[toy.forward]] * method.batches
-    weighting = backward(method, parts, toy, scale=scale, lr=LR)
+    parts = [[partial(toy.forward, number) for number in numbers]] * method.batches
+    weighting = backward(method, parts, toy, scale=scale, lr=LR, together=together)
     with torch.no_grad():
         for parameter in parameters:
             if parameter.grad is not None:
                 grad = parameter.grad / scale
                 parameter.sub_(LR * grad / grad.norm().clamp_min(1.0))
     if method.reevaluates:
-        reevaluate(method, weighting.step, parts[0], toy)
+        reevaluate(method, weighting.step, parts[0], toy, together)
     return weighting
 
 
@@ -184,6 +199,26 @@ def _loss_scale(kind: type[Method]) -> None:
         raise ValueError(f"a loss scale of 1024 leads elsewhere: {plain} and {scaled}")
 
 
+def _two_ranks(kind: type[Method]) -> None:
+    """Two ranks with a part of each batch do, bit for bit, what one process does with both."""
+
+    def trained(numbers: Sequence[int], together: Together) -> list[list[float]]:
+        method, toy = kind(LOSSES, seed=3), Quadratics()
+        weights = [
+            list(step_toy(method, toy, numbers=numbers, together=together).weights.values())
+            for _ in range(3)
+        ]
+        return [*weights, *(parameter.flatten().tolist() for parameter in toy.parameters())]
+
+    one = trained((0, 1), ALONE)
+    for rank, several in enumerate(side_by_side(2, lambda r: trained((r.rank,), Together(r)))):
+        if several != one:
+            raise ValueError(
+                f"rank {rank} of two differs from one process with both parts of a batch: keep "
+                f"state in the instance, and draw from self.generator only; {several} and {one}"
+            )
+
+
 # --- on hard inputs -------------------------------------------------------------------------------
 
 
@@ -275,6 +310,7 @@ METHOD_CHECKS: dict[str, Callable[[type[Method]], None]] = {
     "order of losses": _permutation,
     "missing labels": _missing_labels,
     "invisible loss scale": _loss_scale,
+    "two ranks are one": _two_ranks,
     "space of hyper-parameters": _space,
     "replayable": _replayable,
 }

@@ -1,0 +1,93 @@
+"""Running statistics of batch norms: left alone by passes that do not count, one on all ranks.
+
+A batch norm's statistics follow the parts of a batch one after another: r <- (1 - m) r + m s. What
+n parts each on W ranks make of them is therefore, of the ranks' own r_i that all began with r_0,
+
+    (1-m)^(nW) r_0 + sum_i (1-m)^(n(W-1-i)) (r_i - (1-m)^n r_0),
+
+which is one sum over ranks: exact, but for rounding.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from mtl_bench.core.ranks import Ranks
+
+Norm = nn.modules.batchnorm._BatchNorm
+
+
+class Modules(Protocol):
+    def modules(self) -> Iterator[nn.Module]: ...
+
+
+def _norms(model: Modules) -> list[Norm]:
+    return [m for m in model.modules() if isinstance(m, Norm)]
+
+
+@contextlib.contextmanager
+def frozen_statistics(model: Modules) -> Iterator[None]:
+    """Training mode whose batch norms leave their running statistics alone."""
+    norms = _norms(model)
+    tracked = [m.track_running_stats for m in norms]
+    for norm in norms:
+        norm.track_running_stats = False
+    try:
+        yield
+    finally:
+        for norm, value in zip(norms, tracked, strict=True):
+            norm.track_running_stats = value
+
+
+@contextlib.contextmanager
+def common_statistics(model: Modules, ranks: Ranks) -> Iterator[None]:
+    """Every rank's batch norms after it are as if one rank had seen all parts that passed inside.
+
+    Raises:
+        ValueError: a batch norm without momentum, whose statistics are means over all steps.
+    """
+    if ranks.size == 1:
+        yield
+        return
+    before = [_Seen(norm) for norm in _norms(model) if norm.num_batches_tracked is not None]
+    yield
+    moved = [(was, now) for was in before if (now := _Seen(was.norm)).parts != was.parts]
+    if not moved:
+        return
+    terms = [_term(was, now, ranks) for was, now in moved]
+    merged = ranks.sum_(torch.cat(terms)).split([len(term) for term in terms])
+    for (was, now), value in zip(moved, merged, strict=True):
+        now.set(value, was.parts + (now.parts - was.parts) * ranks.size)
+
+
+class _Seen:
+    """A batch norm's statistics as they are: mean and variance side by side, in float64."""
+
+    def __init__(self, norm: Norm) -> None:
+        assert norm.num_batches_tracked is not None
+        self.norm, self.parts = norm, int(norm.num_batches_tracked)
+        self.value = torch.cat([buffer.double() for buffer in self._buffers()])
+
+    def _buffers(self) -> tuple[Tensor, Tensor]:
+        assert self.norm.running_mean is not None
+        assert self.norm.running_var is not None
+        return self.norm.running_mean, self.norm.running_var
+
+    def set(self, value: Tensor, parts: int) -> None:
+        for buffer, new in zip(self._buffers(), value.chunk(2), strict=True):
+            buffer.data.copy_(new)  # `.data`: a backward pass that is still to come has seen them
+        assert self.norm.num_batches_tracked is not None
+        self.norm.num_batches_tracked.fill_(parts)
+
+
+def _term(was: _Seen, now: _Seen, ranks: Ranks) -> Tensor:
+    """What this rank adds to the sum."""
+    momentum, parts = was.norm.momentum, now.parts - was.parts
+    if momentum is None:
+        raise ValueError("a batch norm with momentum None does not train on several ranks")
+    kept = (1 - momentum) ** parts
+    own = kept ** (ranks.size - 1 - ranks.rank) * (now.value - kept * was.value)
+    return own + kept**ranks.size * was.value if ranks.first else own
