@@ -92,7 +92,10 @@ def test_a_wrong_gradient_method_is_caught(tmp_path, monkeypatch, line, caught):
 
 def test_a_space_of_what_the_constructor_does_not_take_is_caught(tmp_path, monkeypatch):
     text = BROKEN.replace("(LossMethod):", "(LossMethod):\n    space = {space}")
-    for space, caught in (("{'seed': [1, 2]}", False), ("{'rate': [1e-3]}", True)):
+    text = text.replace("seed=0):", "seed=0, pace=1.0):")
+    spaces = (("pace", False), ("rate", True), ("seed", True))  # a seed is not for trials to choose
+    for key, caught in spaces:
+        space = f"{{'{key}': [1, 2]}}"
         failed = failed_checks(
             tmp_path, monkeypatch, text.format(space=space, line="return loss_K.sum()")
         )
