@@ -72,7 +72,7 @@ def test_a_planted_gain_is_found_and_copies_of_equal_weights_are_not(tmp_path, m
     result = CliRunner().invoke(app, ["ablate", "--grid", str(file), *told])
     assert result.exit_code == 0, result.output
     table = (tmp_path / "reports" / "planted" / "table.md").read_text()
-    lines = table[table.index("Against fixed") : table.index("Chosen settings")].splitlines()
-    said = {line.split("|")[1].strip(): line for line in lines if line.startswith("|")}
+    section = table[table.index("**Against fixed**") :].split("\n\n")[1]
+    said = {line.split("|")[1].strip(): line for line in section.splitlines()}
     assert "| better |" in said["planted"].replace("**", "")
     assert not [name for name in names if "| better |" in said[name]]
