@@ -8,8 +8,9 @@ BIN := $(VENV)/bin
 ablate: $(VENV)/installed
 	$(BIN)/mtl-bench ablate --grid backbones
 
-test: lint  # one file of tests a core; more threads than cores would wait for each other
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
+# One file of tests a core, those of whole runs first; more threads than cores would wait for each other
+test: lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
