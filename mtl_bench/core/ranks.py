@@ -387,7 +387,7 @@ def check_share(optim: "Optim", size: int) -> None:
     if parts % size:
         raise ValueError(
             f"{size} ranks cannot share the {parts} part{'s' * (parts > 1)} of a batch: "
-            f"recipe.optim.micro_batch = {optim.micro_batch} of recipe.optim.batch = "
+            f"recipe.optim.micro_batch = {optim.micro_batch or 'none'} of recipe.optim.batch = "
             f"{optim.batch}; set micro_batch, or take a number of ranks that divides {parts}"
         )
 
