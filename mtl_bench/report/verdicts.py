@@ -23,6 +23,7 @@ from mtl_bench.report import evidence
 from mtl_bench.report.columns import DELTA, Row, column, measured, text
 from mtl_bench.report.evidence import Array, Comparison, Estimate
 from mtl_bench.report.statistics import (
+    SHOWN,
     axes_of,
     by_recipe,
     cell_of,
@@ -84,6 +85,7 @@ class Verdicts:
     scores: Scores
     smoke: bool
     left_out: tuple[str, ...]  # problems in which the control has no gain
+    stale: str  # recipes whose runs are of older code, and which; empty: none
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -100,12 +102,12 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
     """Hold every line of a grid against one; None where no other shares two blocks with it.
 
     Args:
-        rows: with `delta.gain` among their metrics where they are done; failed ones, too.
+        rows: with `delta.gain` among their metrics where they have numbers; failed ones, too.
         axis: the field of a cell that names a line.
         control: its value that the others are held against.
     """
     recipes = by_recipe(rows)
-    rows = [row for row in rows if row.get("status", "done") in ("done", "failed")]
+    rows = _comparable(rows, axis, control)
     of = scores(rows, axis)
     if control not in of.labels:
         return None
@@ -145,7 +147,32 @@ def judge(rows: Sequence[Row], axis: str, control: str) -> Verdicts | None:
     lines = [line for i, line in found.items() if i != at]
     lines.sort(key=lambda line: -np.nan_to_num(line.comparison.difference.mean, nan=-1e9))
     smoke = any(row.get("smoke") for row in rows)
-    return Verdicts(found[at], tuple(lines), of, smoke, tuple(left_out))
+    return Verdicts(found[at], tuple(lines), of, smoke, tuple(left_out), _stale(rows))
+
+
+def _comparable(rows: Sequence[Row], axis: str, control: str) -> list[Row]:
+    """What failed, and of every problem the runs by the code of today, or, where its control has
+    none of those, the stale ones."""
+    rows = [row for row in rows if row.get("status", "done") in (*SHOWN, "failed")]
+    current = {
+        recipe_of(row)
+        for line, _, row in _named(rows, axis)
+        if line == control and row.get("status", "done") == "done"
+    }
+    return [
+        row
+        for row in rows
+        if row.get("status") == "failed"
+        or (row.get("status") == "stale") != (recipe_of(row) in current)
+    ]
+
+
+def _stale(rows: Sequence[Row]) -> str:
+    """Recipes whose runs are stale, and the commits that these were of."""
+    stale = [row for row in rows if row.get("status") == "stale"]
+    commits = {str(row.get("env", {}).get("git_commit") or "unknown")[:7] for row in stale}
+    names = ", ".join(by_recipe(stale))
+    return f"{names} (commit {', '.join(sorted(commits))})" if stale else ""
 
 
 def scores(rows: Sequence[Row], axis: str) -> Scores:
@@ -239,7 +266,8 @@ def untested(control: str, lines: Sequence[str]) -> str:
         return f"Nothing is tested against '{control}': {why}."
     return (
         f"Nothing is tested against '{control}': it takes two seeds or problems in which this line "
-        "and another have a log gain. The baseline of the gain has none; stale runs do not count."
+        "and another have a log gain, both by the code of today or both stale. The baseline of the "
+        "gain has none."
     )
 
 
@@ -275,6 +303,11 @@ def notes(found: Verdicts) -> list[str]:
         said.append(
             f"Left out: {', '.join(found.left_out)}, where {found.control.label} has no log gain: "
             "its own numbers or the baseline's are missing."
+        )
+    if found.stale:
+        said.append(
+            f"Stale, all runs that are compared: {found.stale}. Code has changed since; "
+            "--rerun stale runs them again."
         )
     if any(has_fewer(line, found) for line in found.lines):
         said.append(

@@ -40,6 +40,26 @@ def verdict_of(rows, name):
     return next(line.comparison for line in found.lines if line.label == name)
 
 
+def test_stale_runs_are_compared_with_each_other_and_said():
+    rows = suite(range(8))
+    whole = judge(rows, "method", "fixed")
+    for row in rows:
+        row |= {"status": "stale", "env": {"git_commit": "0123456789"}}
+    found = judge(rows, "method", "fixed")
+    assert sentence(found) == sentence(whole)
+    assert "Stale, all runs that are compared: small (commit 0123456)" in " ".join(notes(found))
+    assert not [said for said in notes(whole) if "Stale" in said]
+
+
+def test_a_stale_run_is_not_held_against_a_control_of_today():
+    rows = suite(range(8))
+    for row in rows:
+        row["status"] = "stale" if row["method"] == "ahead" else "done"
+    found = judge(rows, "method", "fixed")
+    assert [line.label for line in found.lines] == ["same", "behind"]
+    assert found.stale == ""
+
+
 def test_a_busy_machine_makes_no_line_dearer():
     rows = suite(range(8))
     for row in rows[::3]:  # a third of every line's runs, another one each time
