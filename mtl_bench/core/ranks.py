@@ -362,13 +362,13 @@ def _by_environment() -> Processes | None:
     """As torchrun sets it, or else srun: of a step of several tasks each is a rank."""
     env = os.environ
     if "WORLD_SIZE" in env:
-        if int(env["WORLD_SIZE"]) == 1:
+        if _whole("WORLD_SIZE") == 1:
             return None
         lacking = [name for name in OWN if name not in env]
         if lacking:
             raise ValueError(f"WORLD_SIZE = {env['WORLD_SIZE']} is set, but not {lacking[0]}")
-        rank, size, local = (int(env[name]) for name in OWN[:3])
-        return Processes(rank, size, local, (env["MASTER_ADDR"], int(env["MASTER_PORT"])))
+        rank, size, local = map(_whole, OWN[:3])
+        return Processes(rank, size, local, (env["MASTER_ADDR"], _whole("MASTER_PORT")))
     size = int(env.get("SLURM_STEP_NUM_TASKS", "1"))
     if size == 1:
         return None
@@ -379,6 +379,16 @@ def _by_environment() -> Processes | None:
     port = 20000 + (int(env["SLURM_JOB_ID"]) * 16 + int(env["SLURM_STEP_ID"])) % 20000
     rank, local = int(env["SLURM_PROCID"]), int(env["SLURM_LOCALID"])
     return Processes(rank, size, local, (nodes[0] if len(nodes) > 1 else HERE, port))
+
+
+def _whole(name: str) -> int:
+    """A number of the environment."""
+    value = os.environ[name]
+    if not value.isdecimal():
+        raise ValueError(
+            f"the environment's {name} = {value!r}: a whole number, as torchrun sets it"
+        )
+    return int(value)
 
 
 def check_share(optim: "Optim", size: int) -> None:
