@@ -385,9 +385,7 @@ def _whole(name: str) -> int:
     """A number of the environment."""
     value = os.environ[name]
     if not value.isdecimal():
-        raise ValueError(
-            f"the environment's {name} = {value!r}: a whole number, as torchrun sets it"
-        )
+        raise ValueError(f"{name} = {value!r} is set, and is no whole number: unset it")
     return int(value)
 
 

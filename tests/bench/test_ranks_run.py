@@ -125,6 +125,10 @@ def test_torchruns_variables(environment):
     environment(RANK="3", WORLD_SIZE="8", LOCAL_RANK="1", MASTER_ADDR="node7")
     with pytest.raises(ValueError, match="WORLD_SIZE = 8 is set, but not MASTER_PORT"):
         joined()
+    environment(WORLD_SIZE="two")
+    with pytest.raises(ValueError, match="WORLD_SIZE = 'two' is set, and is no whole number"):
+        joined()
+    environment(WORLD_SIZE="8")
     environment(MASTER_PORT="1234")
     found = joined(2)
     assert isinstance(found, Processes)
