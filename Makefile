@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: ablate test lint readme clean
+.PHONY: ablate test slurm lint readme clean
 
 ablate: $(VENV)/installed
 	$(BIN)/mtl-bench ablate --grid backbones
@@ -11,6 +11,11 @@ ablate: $(VENV)/installed
 # One file of tests a core, those of whole runs first; more threads than cores would wait for each other
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# For the tests of clusters, on Debian as root; where it cannot be had they are skipped and say so
+slurm:
+	-command -v slurmctld || { apt-get -q update && \
+		DEBIAN_FRONTEND=noninteractive apt-get -q install -y --no-install-recommends slurmctld slurmd slurm-client; }
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
