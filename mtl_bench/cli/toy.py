@@ -76,12 +76,22 @@ def _walked(
     import concurrent.futures
     import multiprocessing
 
+    found = {}
     if jobs == 1:
-        return [_walk(name, rates, steps) for name in names]
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(jobs, context) as pool:
-        pending = [pool.submit(_walk, name, rates, steps) for name in names]
-        return [one.result() for one in pending]
+        for name in names:
+            found[name] = _walk(name, rates, steps)
+            typer.echo(name, err=True)
+    else:
+        context = multiprocessing.get_context("spawn")
+        pool = concurrent.futures.ProcessPoolExecutor(jobs, context)
+        try:
+            pending = {pool.submit(_walk, name, rates, steps): name for name in names}
+            for done in concurrent.futures.as_completed(pending):
+                found[pending[done]] = done.result()
+                typer.echo(pending[done], err=True)
+        finally:
+            pool.shutdown(cancel_futures=True)  # a signal waits for the methods under way alone
+    return [found[name] for name in names]
 
 
 def _walk(name: str, rates: list[float], steps: int) -> "dict[float, list[problem.Path]]":

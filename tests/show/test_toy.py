@@ -116,7 +116,8 @@ def test_both_pictures_are_drawn(tmp_path):
     options = ["--lrs", "0.05,0.2", "--steps", 100, "--jobs", 1, "--dpi", 60]
     done = figure("--methods", "fixed,uncertainty+mgda", "--out", out, *options)
     assert done.exit_code == 0, done.output
-    assert done.output.split() == [str(out), str(tmp_path / "toy-steps.png")]
+    assert done.stdout.split() == [str(out), str(tmp_path / "toy-steps.png")]
+    assert done.stderr.split() == ["fixed", "uncertainty+mgda"]
     for path in map(tmp_path.joinpath, ("toy.png", "toy-steps.png")):
         assert len(Image.open(path).convert("RGB").getcolors(1 << 20)) > 20
 
