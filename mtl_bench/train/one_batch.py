@@ -171,13 +171,12 @@ class _Normalised(torch.autograd.Function):
         sums_2C = torch.stack([grad_.sum(_axes(x)), (grad_ * centred).sum(_axes(x))])
         of_x = of_weight = of_bias = None
         if ctx.needs_input_grad[1]:
-            of_weight = (sums_2C[1] * scale_C).to(weight)
+            of_weight = sums_2C[1] * scale_C
         if ctx.needs_input_grad[2]:
-            of_bias = sums_2C[0].to(weight).clone()
+            of_bias = sums_2C[0].clone()
         if ctx.needs_input_grad[0]:
             mean_2C = ctx.ranks.sum_(sums_2C) / count
             slope = (mean_2C[1] * scale_C.square()).view(shape)
             factor_C = scale_C if weight is None else scale_C * weight
             of_x = (grad_ - mean_2C[0].view(shape) - centred * slope) * factor_C.view(shape)
-            of_x = of_x.to(x.dtype)
         return of_x, of_weight, of_bias, None, None, None, None, None

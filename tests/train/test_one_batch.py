@@ -9,9 +9,8 @@ from unittest import mock
 
 import pytest
 import torch
-from support.ranks import started, trained
+from support.ranks import flat, network_cell, started, stopped, trained, trunk_cell
 from support.training import curve, run, scales_root
-from test_ranks import flat, network_cell, stopped, trunk_cell
 from timm.layers import BatchNormAct2d
 from torch import nn
 
@@ -28,7 +27,7 @@ from mtl_bench.train.loop import build
 ONE_BATCH = ("recipe.optim.micro_batch=none", "recipe.optim.one_batch=true")
 ON_THE_NETWORK = (
     *("fixed_uncertainty", "nash", "graddrop", "mgda_ub"),  # one of each kind
-    *("famo", "samo+mgda", "auto_lambda", "uncertainty+pcgrad"),  # evaluated again, composed
+    *("samo+mgda", "uncertainty+pcgrad"),  # evaluated again, composed
 )
 ON_A_TRUNK = ("uncertainty", "cagrad", "moco", "modo", "fixed+auto_lambda", "uncertainty+mgda_ub")
 WRAPPERS = ("cr", "samo")
