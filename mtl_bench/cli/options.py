@@ -117,8 +117,8 @@ RanksOption = Annotated[
         metavar="N",
         min=1,
         help="Processes that train a cell together, each some of the parts of a batch that "
-        "recipe.optim.micro_batch makes, and each on a GPU of its own where there are any. It "
-        "changes no number.",
+        "recipe.optim.micro_batch makes, or with recipe.optim.one_batch some of its samples, and "
+        "each on a GPU of its own where there are any. It changes no number but by rounding.",
         rich_help_panel=RUNNING,
         show_default=False,
     ),

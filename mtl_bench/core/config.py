@@ -74,6 +74,7 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("evaluate", "protocol"),
     ("evaluate", "also"),
     ("evaluate", "flip"),
+    ("optim", "one_batch"),
 )
 
 NOT_SET = {

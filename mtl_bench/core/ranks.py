@@ -1,8 +1,9 @@
-"""Ranks: the processes that train one cell together, each some parts of every batch.
+"""Ranks: the processes that train one cell together, each some parts or samples of every batch.
 
 Rank 0 runs the cell as a single process would and tells the others what to train. What they share
-is little: small plain values, gathered in the order of the ranks, and sums of tensors. One rank
-alone is `Ranks` itself, whose every operation is the identity; there is no process group then.
+is little: small plain values, gathered in the order of the ranks, sums of tensors, and tensors side
+by side. One rank alone is `Ranks` itself, whose every operation is the identity; there is no
+process group then.
 
 Ranks are told who they are by their environment, as torchrun and srun set it, or rank 0 starts the
 others itself. All meet at a store that rank 0 serves. There each beats, and watches the others: one
@@ -62,6 +63,10 @@ class Ranks:
 
     def sum_(self, tensor: "Tensor") -> "Tensor":
         """A tensor becomes the sum over all ranks."""
+        return tensor
+
+    def join(self, tensor: "Tensor") -> "Tensor":
+        """Every rank's tensor [n,...], of one shape, one after another by rank: [size*n,...]."""
         return tensor
 
     def any(self, flag: bool) -> bool:
@@ -193,6 +198,15 @@ class Processes(Ranks):
         with self._or_lost():
             torch.distributed.all_reduce(tensor)
         return tensor
+
+    def join(self, tensor: "Tensor") -> "Tensor":
+        import torch
+
+        mine = tensor.contiguous().flatten().view(torch.uint8)  # of any type
+        found = mine.new_empty(self.size, len(mine))
+        with self._or_lost():
+            torch.distributed.all_gather(list(found), mine)
+        return found.view(tensor.dtype).view(self.size * len(tensor), *tensor.shape[1:])
 
     @contextlib.contextmanager
     def _or_lost(self) -> Iterator[None]:
@@ -390,7 +404,14 @@ def _whole(name: str) -> int:
 
 
 def check_share(optim: "Optim", size: int) -> None:
-    """Raises: ValueError: so many ranks cannot have equally many parts of a batch."""
+    """Raises: ValueError: so many ranks cannot have equally many parts, or samples, of a batch."""
+    if optim.one_batch:
+        if optim.batch % size:
+            raise ValueError(
+                f"{size} ranks cannot share the {optim.batch} samples of a batch: take a number of "
+                f"ranks that divides recipe.optim.batch"
+            )
+        return
     parts = optim.batch // (optim.micro_batch or optim.batch)
     if parts % size:
         raise ValueError(

@@ -139,6 +139,11 @@ class Optim(Checked):
         Annotated[int, least(2)] | None,
         "samples in memory at once, added up to a batch, which it divides; none: all",
     ] = None
+    one_batch: Annotated[
+        bool,
+        "several ranks share the samples of a whole batch, whose losses and batch norms stay those "
+        "of one batch; without it they share the parts that micro_batch makes",
+    ] = False
     lr: Annotated[NotNegative, "learning rate of backbone, GCM and pose network"] = 1e-4
     head_lr_factor: Annotated[NotNegative, "times lr: of decoders and heads"] = 10.0
     method_lr: Annotated[NotNegative, "of a method's own parameters"] = 1e-4
@@ -165,6 +170,11 @@ class Optim(Checked):
             raise ValueError(
                 f"recipe.optim.micro_batch = {self.micro_batch} does not divide a batch of "
                 f"{self.batch}; set it to a divisor of recipe.optim.batch"
+            )
+        if self.one_batch and self.micro_batch is not None:
+            raise ValueError(
+                f"recipe.optim.one_batch = true keeps a batch in one part, and micro_batch = "
+                f"{self.micro_batch} does not: set recipe.optim.micro_batch=none"
             )
 
 

@@ -190,7 +190,7 @@ def _looked_at(
     Weights may depend on all losses, so a batch in several parts is run twice: for its losses, and
     for its gradients once the weights are known.
     """
-    single = [parts[0]()] if len(parts) == together.ranks.size == 1 else []
+    single = [parts[0]()] if together.have_all(parts) else []
     seen = together.losses([single[0].losses]) if single else losses_of(parts, model, together)
     count = Counter(name for losses in seen for name in gather(losses, method.terms))
     return seen, count, (single.pop() if single else part() for part in parts)
@@ -247,7 +247,7 @@ def _by_losses(
             if not mine:
                 continue
             if cosines and number == 0:
-                cosine_of = _measured(mine, _trained(passed), model)
+                cosine_of = _measured(mine, _trained(passed), model, together)
             grads = [scaled[name] / count[name] for name in mine]
             torch.autograd.backward(list(mine.values()), grads)
     together.grads([*trainable(model.shared_parameters()), *trainable(model.task_parameters())])
@@ -263,12 +263,18 @@ def _differentiate(method: LossMethod, step: Step, scale: float) -> tuple[float,
     return total.item(), leaf_K.grad
 
 
-def _measured(losses: Mapping[str, Tensor], z: list[Tensor], model: Split) -> dict[str, float]:
+def _measured(
+    losses: Mapping[str, Tensor], z: list[Tensor], model: Split, together: Together
+) -> dict[str, float]:
     """Cosines of the losses' gradients, whose graph stays."""
-    shared, rows = trainable(model.shared_parameters()), []
-    for loss in losses.values():
+    shared = trainable(model.shared_parameters())
+    row_of: dict[str, Gradient] = {}
+    for name, loss in losses.items():
         z_grads = torch.autograd.grad(loss, z, retain_graph=True, allow_unused=True)
-        rows.append(onward(z, z_grads, shared, keep=True))
+        row_of[name] = onward(z, z_grads, shared, keep=True)
+    if together.one_batch:
+        row_of |= together.rows([*row_of], row_of, shared)
+    rows = list(row_of.values())
     return cosines_of(list(losses), products(rows, rows))
 
 
@@ -477,7 +483,7 @@ class _ByGradients:
                 if not mine:
                     continue
                 if cosines and number == 0:
-                    measured = _measured(mine, z, self.model)
+                    measured = _measured(mine, z, self.model, self.together)
                 z_grads = _through_decoders(mine, z, self.own, own_of, 1.0)
                 here = [names.index(name) for name in z_grads]
                 weighted = combine((weight_K * factor_K)[here], list(z_grads.values()))

@@ -20,7 +20,7 @@ from mtl_bench.core.terms import Term
 from mtl_bench.data.loader import train_batches
 from mtl_bench.data.samples import open_samples
 from mtl_bench.model import Model, build_model
-from mtl_bench.train import checkpoint
+from mtl_bench.train import checkpoint, one_batch
 from mtl_bench.train.backward import Forward, Pass, UnlabelledError, Weighting, backward, reevaluate
 from mtl_bench.train.compose import compose
 from mtl_bench.train.curve import Curve, Unwritten
@@ -53,7 +53,7 @@ def train(
 
     Args:
         root: the data set.
-        ranks: those that share the parts of every batch.
+        ranks: those that share the parts of every batch, or the samples of one whole batch.
         run_dir: where `last.pt` and `curve.csv` are kept.
         start: checkpoint whose model and method a fresh run goes on from; optimiser and learning
             rate begin anew.
@@ -111,8 +111,23 @@ def train(
                 outputs = model(part)
             return Pass(model.losses(outputs, part), outputs.representation)
 
+    def forward_own(own: Batch, whole: Batch, seed: int, whole_seed: int) -> Pass:
+        """Losses of the whole batch, of which this rank's samples went through the network."""
+        with drawing(seed, compute.device), one_batch.Synchronised(ranks), compute.autocast():
+            outputs = model(own)
+        outputs.maps = one_batch.joined(outputs.maps, own, ranks)
+        with drawing(whole_seed, compute.device):  # losses that draw: every rank the same
+            return Pass(model.losses(outputs, whole), outputs.representation)
+
     def parts_of(batch: Batch, number: int) -> list[Forward]:
         """This rank's parts. Each of several draws what it draws from a seed of its own."""
+        if together.one_batch:
+            own = batch.to(compute.device, compute.channels_last)
+            name = f"batch {number}"
+            seeds = (
+                seed_for(cell.seed, purpose) for purpose in (f"{name} part {ranks.rank}", name)
+            )
+            return [partial(forward_own, own, one_batch.whole(own, ranks), *seeds)]
         split = batch.split(optim.micro_batch or optim.batch)
         several, before = len(split) * ranks.size > 1, len(split) * ranks.rank
         return [
@@ -127,7 +142,8 @@ def train(
     def check(losses: Mapping[str, Tensor]) -> None:
         check_finite(losses, step)
 
-    together = Together(ranks, check, compute.device)
+    shared = optim.one_batch and ranks.size > 1
+    together = Together(ranks, check, compute.device, shared)
     pace = Pace()
     with Curve(run_dir / "curve.csv", step) if ranks.first else Unwritten() as curve:
         while step < optim.steps:

@@ -2,11 +2,13 @@
 
 Every rank has some parts of a batch. All hear the losses of all parts, in the batch's order, and
 sum their gradients; whatever follows from these each computes for itself, from the same numbers.
+Or all have the one part that a whole batch is, of which each differentiates its own samples, see
+`one_batch`: they take rank 0's losses, which are everyone's but for rounding, and sum as before.
 Of one rank alone nothing is sent and nothing copied.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -29,11 +31,17 @@ class Together:
     Args:
         check: raises where they are not what a method may see; on all ranks, or on none.
         device: where losses lie.
+        one_batch: whether every rank has the losses of the whole batch.
     """
 
     ranks: Ranks = ALONE
     check: Callable[[Mapping[str, Tensor]], None] = _any
     device: str | torch.device = "cpu"
+    one_batch: bool = False
+
+    def have_all(self, parts: Sequence[object]) -> bool:
+        """Whether this rank's one part is all that there is of a batch."""
+        return len(parts) == 1 and (self.ranks.size == 1 or self.one_batch)
 
     def losses(self, parts: Sequence[Mapping[str, Tensor]]) -> Sequence[Mapping[str, Tensor]]:
         """Detached losses of all ranks' parts, from those of this one's."""
@@ -49,7 +57,7 @@ class Together:
         told = self.ranks.gather([{name: next(values) for name in losses} for losses in parts])
         return [
             {name: torch.tensor(value, device=self.device) for name, value in losses.items()}
-            for of_rank in told
+            for of_rank in (told[:1] if self.one_batch else told)
             for losses in of_rank
         ]
 
@@ -102,5 +110,7 @@ class Together:
                 parameter.grad = grad
 
     def statistics(self, model: Modules) -> AbstractContextManager[None]:
-        """See `common_statistics`."""
+        """See `common_statistics`; those of one batch are common already."""
+        if self.one_batch:
+            return nullcontext()
         return common_statistics(model, self.ranks)

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import torch
 
-from mtl_bench.core.config import Cell, from_dict, to_dict
+from mtl_bench.core.config import Cell, from_dict, load_recipe, override, to_dict
 from mtl_bench.core.ranks import Processes
+from support.training import scales_cell
+
+STEPS = ["recipe.optim.steps=3", "recipe.optim.checkpoint_every=3", "recipe.optim.cosine_every=2"]
 
 
 def serve(rank: int, size: int, port: int, connection) -> None:
@@ -78,3 +81,45 @@ def trained(ranks, cell, root: Path, run_dir: Path, options=None) -> None:
     run_dir.mkdir(exist_ok=True)
     progress = None if ranks.first else Listening(run_dir, print)
     run(cell, root, run_dir, progress, ranks=ranks, **(options or {}))
+
+
+def stopped(ranks, cell, root, run_dir) -> str:
+    """Only the last rank hears a signal, in its second step."""
+    from mtl_bench.train.progress import Interrupted, Listening
+    from support.training import run
+
+    class Asked(Listening):
+        def update(self, stage, step, steps, note=""):
+            self.stop_asked = step == 2 and not ranks.first
+
+    run_dir.mkdir(exist_ok=True)
+    try:
+        run(cell, root, run_dir, Asked(run_dir, print), ranks=ranks)
+    except Interrupted as stop:
+        return str(stop)
+    return "not stopped"
+
+
+# --- small cells, of three steps, and what they leave ---------------------------------------------
+
+
+def network_cell(method: str, *settings: str) -> Cell:
+    cell = Cell(load_recipe("smoke"), "tiny", method)
+    return override(cell, [*STEPS, "recipe.optim.micro_batch=2", *settings])
+
+
+def trunk_cell(method: str, *settings: str) -> Cell:
+    return override(scales_cell(method), [*STEPS, "recipe.optim.micro_batch=4", *settings])
+
+
+def flat(value, place="") -> dict[str, torch.Tensor]:
+    """Every number of a checkpoint, by its place in it."""
+    if isinstance(value, dict):
+        inner = value.items()
+    elif isinstance(value, (list, tuple)):
+        inner = enumerate(value)
+    else:
+        return {place: value if torch.is_tensor(value) else repr(value)}
+    return {
+        key: found for name, one in inner for key, found in flat(one, f"{place}/{name}").items()
+    }

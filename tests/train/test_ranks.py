@@ -6,9 +6,9 @@ from functools import partial
 
 import pytest
 import torch
-from support.ranks import started, trained
+from support.ranks import STEPS, flat, network_cell, started, stopped, trained, trunk_cell
 from support.terms import TERMS
-from support.training import curve, run, scales_cell, scales_root
+from support.training import curve, run, scales_root
 
 from mtl_bench.bench.check.methods import METHOD_CHECKS, Quadratics
 from mtl_bench.bench.check.side_by_side import side_by_side
@@ -24,7 +24,6 @@ from mtl_bench.train.loop import build
 from mtl_bench.train.statistics import common_statistics
 from mtl_bench.train.together import Together
 
-STEPS = ["recipe.optim.steps=3", "recipe.optim.checkpoint_every=3", "recipe.optim.cosine_every=2"]
 ON_THE_NETWORK = ("fixed_uncertainty", "cagrad", "graddrop", "mgda_ub")  # one of each kind
 COMPOSED = (
     *("fixed_uncertainty+pcgrad", "imtl_l+mgda", "uncertainty+modo", "famo+upgrad"),
@@ -41,28 +40,6 @@ WRAPPERS = ("cr", "samo")
 def pair() -> Iterator:
     with started(2) as asked:
         yield asked
-
-
-def network_cell(method: str, *settings: str) -> Cell:
-    cell = Cell(load_recipe("smoke"), "tiny", method)
-    return override(cell, [*STEPS, "recipe.optim.micro_batch=2", *settings])
-
-
-def trunk_cell(method: str, *settings: str) -> Cell:
-    return override(scales_cell(method), [*STEPS, "recipe.optim.micro_batch=4", *settings])
-
-
-def flat(value, place="") -> dict[str, torch.Tensor]:
-    """Every number of a checkpoint, by its place in it."""
-    if isinstance(value, dict):
-        inner = value.items()
-    elif isinstance(value, (list, tuple)):
-        inner = enumerate(value)
-    else:
-        return {place: value if torch.is_tensor(value) else repr(value)}
-    return {
-        key: found for name, one in inner for key, found in flat(one, f"{place}/{name}").items()
-    }
 
 
 def told(run_dir) -> list[dict[str, str]]:
@@ -172,22 +149,6 @@ def test_a_loss_that_is_not_finite_stops_all_ranks_alike(pair, smoke_root, tmp_p
     one, other = pair.errors
     assert one == other
     assert "FloatingPointError: loss term" in one
-
-
-def stopped(ranks, cell, root, run_dir) -> str:
-    """Only the last rank hears a signal, in its second step."""
-    from mtl_bench.train.progress import Interrupted, Listening
-
-    class Asked(Listening):
-        def update(self, stage, step, steps, note=""):
-            self.stop_asked = step == 2 and not ranks.first
-
-    run_dir.mkdir(exist_ok=True)
-    try:
-        run(cell, root, run_dir, Asked(run_dir, print), ranks=ranks)
-    except Interrupted as stop:
-        return str(stop)
-    return "not stopped"
 
 
 def test_a_signal_to_one_rank_stops_all_and_any_number_goes_on(pair, tmp_path):

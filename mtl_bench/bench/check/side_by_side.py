@@ -41,6 +41,9 @@ class Thread(Ranks):
         with torch.no_grad():
             return tensor.copy_(sum(brought[1:], brought[0]))
 
+    def join(self, tensor: Tensor) -> Tensor:
+        return torch.cat(self._meeting.exchange(self.rank, tensor.detach().clone()))
+
 
 def side_by_side(size: int, work: Callable[[Ranks], Found]) -> list[Found]:
     """What each of so many ranks makes of it; an error of any of them."""
