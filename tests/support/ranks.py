@@ -69,7 +69,7 @@ def started(size: int):
         for ours, _ in pipes:
             ours.send(None)
         for process in processes:
-            process.join(30)
+            process.join(120)  # of a busy machine
             assert process.exitcode == 0
 
 
