@@ -26,11 +26,19 @@ from mtl_bench.core.plain import from_dict, to_dict
 from mtl_bench.core.ranks import ALONE, Processes, Ranks
 from mtl_bench.core.task import tasks_of_cell
 from mtl_bench.data.samples import open_samples
-from mtl_bench.evaluate.walk import Evaluation, evaluate, evaluating, open_walks, rehearse
+from mtl_bench.evaluate.labels import label
+from mtl_bench.evaluate.walk import (
+    Evaluation,
+    evaluate,
+    evaluate_together,
+    evaluating,
+    open_walks,
+    rehearse,
+)
 from mtl_bench.model import Model
 from mtl_bench.train import checkpoint
 from mtl_bench.train.curve import data_share, training_time
-from mtl_bench.train.loop import CHECKPOINT, train
+from mtl_bench.train.loop import CHECKPOINT, check_equal, train
 from mtl_bench.train.progress import Interrupted, Listening, Progress
 from mtl_bench.train.tracking import Tracker
 
@@ -62,7 +70,7 @@ def run_cell(
         run_dir: the cell's folder, which exists (see `store.begin`).
         root: the data set.
         echo: where lines of text go.
-        ranks: that train it together; this is their first, and the others `follow`.
+        ranks: that run it together; this is their first, and the others `follow`.
 
     Returns:
         The row, as `row.json` has it.
@@ -94,7 +102,8 @@ def run_cell(
     model, took = trained.model, trained.time
     echo(f"trained in {took['train_s']:.0f} s ({took['step_ms']:.0f} ms a step)")
 
-    evaluation, eval_s = _evaluate(model, cell, root, compute, progress)
+    _tell(ranks, "evaluate", cell, compute, root=root, run_dir=run_dir)
+    evaluation, eval_s = _evaluate(model, cell, root, compute, progress, ranks)
     _save_samples(run_dir / "samples.npz", evaluation.samples)
 
     progress.update("latency", 0, 1)
@@ -171,16 +180,40 @@ def renew(
 
 
 def _evaluate(
-    model: Model, cell: Cell, root: Path, compute: Compute, progress: Progress
+    model: Model,
+    cell: Cell,
+    root: Path,
+    compute: Compute,
+    progress: Progress,
+    ranks: Ranks = ALONE,
 ) -> tuple[Evaluation, float]:
     """With the seconds that it took."""
     start = time.perf_counter()
-    evaluation = evaluate(
-        model, cell, root, compute.device, progress=lambda n, of: progress.update("evaluate", n, of)
-    )
+
+    def note(done: int, of: int) -> None:
+        progress.update("evaluate", done, of)
+
+    if ranks.size == 1:
+        evaluation = evaluate(model, cell, root, compute.device, progress=note)
+    else:
+        evaluation = _evaluate_together(model, cell, root, compute, ranks, note)
     eval_s = time.perf_counter() - start
     progress.say(f"evaluated in {eval_s:.0f} s: {CELLS.headline(evaluation.metrics)}")
     return evaluation, eval_s
+
+
+def _evaluate_together(
+    model: Model,
+    cell: Cell,
+    root: Path,
+    compute: Compute,
+    ranks: Ranks,
+    note: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Of rank 0 the evaluation, of another one an empty one."""
+    check_equal(model, ranks, cell.recipe.optim.steps)
+    with ranks.sharing_cores():
+        return evaluate_together(model, cell, root, compute.device, ranks, progress=note)
 
 
 # --- training -------------------------------------------------------------------------------------
@@ -209,18 +242,17 @@ def _train(
             _, start = _result_of(parent, run_dir.parent, of_parent)
     if cell.video:
         assert start is not None
+        _tell(ranks, "label", cell, compute, root=root, run_dir=run_dir, start=start)
         further_labels, frames = _pseudo_labels(
-            cell, start, root, run_dir, compute, progress, taken
+            cell, start, root, run_dir, compute, progress, taken, ranks
         )
         protocol = {"pseudo_frames": frames}
     if compute.device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(compute.device)
     given = (cell, root, run_dir, compute, progress, tracker)
     rehearsal = partial(rehearse, cell=cell, root=root, device=compute.device)
-    paths = {"root": root, "run_dir": run_dir, "start": start, "record": record}
-    paths["further_labels"] = further_labels
-    told = {name: None if path is None else str(path.resolve()) for name, path in paths.items()}
-    ranks.tell({"cell": to_dict(cell), **told}, compute.device)
+    paths = {"start": start, "record": record, "further_labels": further_labels}
+    _tell(ranks, "train", cell, compute, root=root, run_dir=run_dir, **paths)
     with ranks.sharing_cores():
         model = train(
             *given,
@@ -237,25 +269,6 @@ def _train(
     return Trained(model, {"train_s": train_s, "step_ms": step_ms, **waited, **taken}, protocol)
 
 
-def follow(ranks: Processes, device: str = "auto") -> None:
-    """Of a rank behind the first: train with it what it trains, until it has ended."""
-    while (told := ranks.told()) is not None:
-        cell = from_dict(Cell, told.pop("cell"))
-        root, run_dir = Path(told.pop("root")), Path(told.pop("run_dir"))
-        paths = {name: None if path is None else Path(path) for name, path in told.items()}
-        compute = Compute(choose_device(device, ranks), cell.recipe.optim.precision)
-        progress = Listening(run_dir, print)
-        progress.catch_signals()
-        ranks.begin(compute.device)
-        train(
-            *(cell, root, run_dir, compute, progress, Tracker("off", cell, run_dir)),
-            ranks=ranks,
-            start=paths["start"],
-            further_labels=paths["further_labels"],
-            record=paths["record"],
-        )
-
-
 def _pseudo_labels(
     cell: Cell,
     parent_checkpoint: Path,
@@ -264,6 +277,7 @@ def _pseudo_labels(
     compute: Compute,
     progress: Progress,
     taken: dict[str, Any],
+    ranks: Ranks,
 ) -> tuple[Path, int]:
     """Make what labels are missing; their folder and number. `taken` gets the seconds."""
     model = load_model(cell.parents[0], parent_checkpoint, compute)
@@ -279,10 +293,10 @@ def _pseudo_labels(
     kind = dataset_of(cell.recipe)
     frames = kind.frames_to_label(root, run_dir / "pseudo_labels", "train", cell.recipe)
     task = next(task for task in model.tasks if task.makes_labels)
-    with evaluating(model):
-        folder = task.label(model, frames, compute.device, note)
+    with evaluating(model), ranks.sharing_cores():
+        folder = label(task, model, frames, compute.device, ranks, note)
     made = counts[-1] - counts[0]
-    if made:  # a run that was killed here made the others, as fast
+    if made and ranks.first:  # a run that was killed here made the others, as fast
         taken["pseudo_s"] = (time.perf_counter() - began) * counts[-1] / made
         write_json(run_dir / TAKEN, taken)
         progress.say(f"labelled {made} frames in {taken['pseudo_s']:.0f} s")
@@ -315,6 +329,45 @@ def _result_of(
     if file == CHECKPOINT:
         checkpoint.require(path, parent)
     return state.row, path
+
+
+# --- several ranks --------------------------------------------------------------------------------
+
+
+def _tell(ranks: Ranks, stage: str, cell: Cell, compute: Compute, **paths: Path | None) -> None:
+    """Say to the ranks behind the first what this one is about to do."""
+    told = {name: None if path is None else str(path.resolve()) for name, path in paths.items()}
+    ranks.tell({"stage": stage, "cell": to_dict(cell), **told}, compute.device)
+
+
+def follow(ranks: Processes, device: str = "auto") -> None:
+    """Of a rank behind the first: do with it what it does, until it has ended."""
+    while (told := ranks.told()) is not None:
+        stage, cell = told.pop("stage"), from_dict(Cell, told.pop("cell"))
+        root, run_dir = Path(told.pop("root")), Path(told.pop("run_dir"))
+        paths = {name: None if path is None else Path(path) for name, path in told.items()}
+        compute = Compute(choose_device(device, ranks), cell.recipe.optim.precision)
+        progress = Listening(run_dir, print)
+        progress.catch_signals()
+        ranks.begin(compute.device)
+        if stage == "label":
+            start = paths["start"]
+            assert start is not None
+            _pseudo_labels(cell, start, root, run_dir, compute, progress, {}, ranks)
+        elif stage == "train":
+            train(
+                *(cell, root, run_dir, compute, progress, Tracker("off", cell, run_dir)),
+                ranks=ranks,
+                start=paths["start"],
+                further_labels=paths["further_labels"],
+                record=paths["record"],
+            )
+        else:
+            model = load_model(cell, run_dir / CHECKPOINT, compute)
+            _evaluate_together(model, cell, root, compute, ranks)
+
+
+# --- parts ----------------------------------------------------------------------------------------
 
 
 def _peak_mib(device: torch.device) -> float:

@@ -69,6 +69,14 @@ class Ranks:
         """Every rank's tensor [n,...], of one shape, one after another by rank: [size*n,...]."""
         return tensor
 
+    def to_first(self, value: Any) -> list[Any]:
+        """At rank 0 every rank's value, by rank; nothing at the others.
+
+        Args:
+            value: plain, or arrays, in lists and dictionaries.
+        """
+        return [value]
+
     def any(self, flag: bool) -> bool:
         return any(self.gather(flag))
 
@@ -77,6 +85,13 @@ class Ranks:
 
     def tell(self, task: dict[str, Any], device: "torch.device") -> None:
         """Rank 0 to the others: what to do next, see `Processes.told`."""
+
+    def still_all(self) -> None:
+        """Worth a call where ranks work long without sharing anything.
+
+        Raises:
+            LostError, KeyboardInterrupt: another rank has ended.
+        """
 
     @contextlib.contextmanager
     def sharing_cores(self) -> Iterator[None]:
@@ -192,6 +207,22 @@ class Processes(Ranks):
             torch.distributed.all_gather(found, mine)
         return [one.numpy().tobytes() for one in found]
 
+    def to_first(self, value: Any) -> list[Any]:
+        import torch
+
+        packed = b"" if self.first else _packed(value)
+        lengths = self.gather(len(packed))
+        with self._or_lost():
+            if not self.first:
+                torch.distributed.send(torch.frombuffer(bytearray(packed), dtype=torch.uint8), 0)
+                return []
+            found = [value]
+            for rank in range(1, self.size):
+                room = torch.empty(lengths[rank], dtype=torch.uint8)
+                torch.distributed.recv(room, rank)
+                found.append(_unpacked(room.numpy().tobytes()))
+        return found
+
     def sum_(self, tensor: "Tensor") -> "Tensor":
         import torch
 
@@ -215,21 +246,21 @@ class Processes(Ranks):
             yield
         except RuntimeError as error:
             end = time.monotonic() + BEAT_S
-            try:
-                while time.monotonic() < end:
-                    self._still_all()
-                    time.sleep(POLL_S)
-            except RuntimeError:
-                raise LostError("rank 0 has gone") from error
+            while time.monotonic() < end:
+                self.still_all()
+                time.sleep(POLL_S)
             raise LostError("another rank has gone without a word") from error
 
-    def _still_all(self) -> None:
-        """Raises: LostError, KeyboardInterrupt: a rank has ended."""
+    def still_all(self) -> None:
         for rank in range(self.size):
-            if rank != self.rank and self._store.check([f"left/{rank}"]):
-                why = self._store.get(f"left/{rank}").decode()
-                if why == INTERRUPTED:
-                    raise KeyboardInterrupt(f"rank {rank} was told to stop")
+            try:
+                ended = rank != self.rank and self._store.check([f"left/{rank}"])
+                why = self._store.get(f"left/{rank}").decode() if ended else ""
+            except RuntimeError as error:
+                raise LostError("rank 0 has gone") from error
+            if why == INTERRUPTED:
+                raise KeyboardInterrupt(f"rank {rank} was told to stop")
+            if ended:
                 raise LostError(f"rank {rank} has ended: {why or 'it was done'}")
 
     # --- what rank 0 tells ------------------------------------------------------------------------
@@ -285,7 +316,7 @@ class Processes(Ranks):
         self._store.set(f"here/{self.rank}", "")
         with self._or_lost():
             while not self._store.check([f"here/{rank}" for rank in range(self.size)]):
-                self._still_all()
+                self.still_all()
                 time.sleep(POLL_S)
             torch.distributed.init_process_group(
                 "cpu:gloo,cuda:nccl" if cuda else "gloo",
@@ -419,6 +450,40 @@ def check_share(optim: "Optim", size: int) -> None:
             f"recipe.optim.micro_batch = {optim.micro_batch or 'none'} of recipe.optim.batch = "
             f"{optim.batch}; set micro_batch, or take a number of ranks that divides {parts}"
         )
+
+
+def _packed(value: Any) -> bytes:
+    """Plain values and arrays as bytes."""
+    import io
+
+    import numpy as np
+    import torch
+
+    def tensors(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: tensors(one) for key, one in value.items()}
+        if isinstance(value, list):
+            return [tensors(one) for one in value]
+        return torch.from_numpy(value.copy()) if isinstance(value, np.ndarray) else value
+
+    file = io.BytesIO()
+    torch.save(tensors(value), file)
+    return file.getvalue()
+
+
+def _unpacked(packed: bytes) -> Any:
+    import io
+
+    import torch
+
+    def arrays(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: arrays(one) for key, one in value.items()}
+        if isinstance(value, list):
+            return [arrays(one) for one in value]
+        return value.numpy() if torch.is_tensor(value) else value
+
+    return arrays(torch.load(io.BytesIO(packed), weights_only=True))
 
 
 def _line(error: BaseException) -> str:

@@ -90,7 +90,11 @@ class Metric:
         raise NotImplementedError
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """What `compute` needs, as arrays that add up over ranks."""
+        """What `compute` and `record` need, as arrays that add up over frames.
+
+        Ranks share an evaluation by it: the states of metrics that have seen one frame each, added
+        in the frames' order, give bit for bit what `update` by these frames gives.
+        """
         raise NotImplementedError
 
     def add(self, state: Mapping[str, NDArray[Any]]) -> None:

@@ -6,6 +6,7 @@ A run that starts at any step, in one process or several, therefore sees the sam
 
 import dataclasses
 import hashlib
+import itertools
 import math
 import signal
 from collections.abc import Iterable, Iterator
@@ -17,6 +18,7 @@ import torch
 from torch import Generator, Tensor
 
 from mtl_bench.core.batch import Batch, collate
+from mtl_bench.core.ranks import Ranks
 from mtl_bench.data.samples import Samples
 
 # Batches that each worker has ready or under way. One is enough: a worker goes on as soon as its
@@ -78,6 +80,45 @@ def eval_batches(samples: Samples, batch_size: int) -> Iterator[Batch]:
         taken.append(sample)
     if taken:
         yield collate(taken)
+
+
+def eval_rounds(
+    samples: Samples, batch_size: int, ranks: Ranks
+) -> Iterator[list[tuple[int, Batch]]]:
+    """The batches of `eval_batches`, shared by ranks: of every round those of this rank.
+
+    Each rank reads as many frames a round as a batch has, so as a rule it has one batch, in the
+    order of the ranks. Where the truth's size changes within them it may have none or several; a
+    batch is of the rank that has read its first frame.
+
+    Yields:
+        Batches, each with the place of its first frame in the split.
+    """
+    start = 0
+    while start < len(samples):
+        first = start + ranks.rank * batch_size
+        own = range(first, min(first + batch_size, len(samples)))
+        read = {index: samples.sample(index, None) for index in own}
+        shapes = ranks.gather([_sizes(sample) for sample in read.values()])
+        cuts = _cuts([shape for of_rank in shapes for shape in of_rank], batch_size)
+        if cuts[-1] - cuts[-2] < batch_size and start + cuts[-1] < len(samples):
+            cuts.pop()  # the last one may go on in frames that nobody has read yet
+        spans = [range(start + a, start + b) for a, b in itertools.pairwise(cuts)]
+        yield [
+            (span[0], collate([read[i] if i in read else samples.sample(i, None) for i in span]))
+            for span in spans
+            if span[0] in read
+        ]
+        start += cuts[-1]
+
+
+def _cuts(shapes: list[Any], batch_size: int) -> list[int]:
+    """Where batches begin, and the last one ends, by the shapes of consecutive frames' truths."""
+    cuts = [0]
+    for index, shape in enumerate(shapes):
+        if index - cuts[-1] == batch_size or shape != shapes[cuts[-1]]:
+            cuts.append(index)
+    return [*cuts, len(shapes)]
 
 
 def _sizes(sample: Batch) -> dict[str, torch.Size]:

@@ -5,6 +5,7 @@ goes over one split with one truth; protocols that share both share the walk.
 """
 
 import contextlib
+import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +19,10 @@ from torch import Tensor, nn
 
 from mtl_bench.core import config
 from mtl_bench.core.batch import Batch, collate
+from mtl_bench.core.ranks import Ranks
 from mtl_bench.core.recipe import NOTHING
 from mtl_bench.core.task import Metric, Results, Size, Task, finish
-from mtl_bench.data.loader import eval_batches
+from mtl_bench.data.loader import eval_batches, eval_rounds
 from mtl_bench.data.samples import Samples, open_samples
 from mtl_bench.model import Model
 
@@ -286,6 +288,114 @@ def _protocol(
     if others:
         protocol["also"] = {m.prefix.removesuffix("."): m.record() for _, m in others}
     return protocol
+
+
+# --- adding up, by several ranks -----------------------------------------------------------------
+
+
+def evaluate_together(
+    model: Model,
+    cell: config.Cell,
+    root: Path,
+    device: torch.device,
+    ranks: Ranks,
+    batch_size: int = 8,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """As `evaluate`, bit for bit, by several ranks, of which each takes batches.
+
+    What a frame adds to a metric is the state of one that has seen this frame alone. Rank 0 adds
+    these in the order of the split, which are the additions of one process.
+
+    Args:
+        progress: of rank 0.
+
+    Returns:
+        At rank 0 what `evaluate` does, at the others an empty evaluation.
+    """
+    walks = open_walks(cell.recipe, model.tasks, root)
+    if not walks:
+        return evaluate(model, cell, root, device)
+    done, total = 0, sum(len(walk.samples) for walk in walks)
+    frames = len(walks[0].samples)
+    gallery, chosen = Gallery(frames), Candidates(frames)
+    input_size: Size = (0, 0)
+    sizes: dict[Size, None] = {}
+    with evaluating(model), torch.inference_mode():
+        for walk in walks:
+            main = walk is walks[0]
+            empty = [copy.deepcopy(metric) for _, metric in walk.measured]
+            for batches in eval_rounds(walk.samples, batch_size, ranks):
+                own = [
+                    _seen(model, walk, empty, batch, device, first, chosen if main else None)
+                    for first, batch in batches
+                ]
+                for seen in (batch for of_rank in ranks.to_first(own) for batch in of_rank):
+                    if main:
+                        input_size = (seen["input"][0], seen["input"][1])
+                        sizes[seen["truth"][0], seen["truth"][1]] = None
+                    for frame in seen["frames"]:
+                        for (_, metric), state in zip(walk.measured, frame["states"], strict=True):
+                            metric.add(state)
+                        if main:
+                            gallery.add(frame["picture"])
+                    done += len(seen["frames"])
+                    if progress:
+                        progress(done, total)
+    if not ranks.first:
+        return Evaluation({}, {})
+    metrics: dict[str, float] = {}
+    for walk in walks:
+        for _, metric in walk.measured:
+            metrics |= metric.compute()
+    protocol = _protocol(cell, walks, input_size, sizes, device)
+    return Evaluation(metrics, protocol, gallery.samples())
+
+
+def _seen(
+    model: Model,
+    walk: Walk,
+    empty: Sequence[Metric],
+    batch: Batch,
+    device: torch.device,
+    first: int,
+    chosen: "Candidates | None",
+) -> dict[str, Any]:
+    """What a batch adds, of plain values and arrays: its sizes, and of every frame the metrics'
+    states and the picture, empty where no report will show it."""
+    found = predict(model, batch.to(device), walk.tasks, true_size(batch))
+    frames = []
+    for slot, name in enumerate(batch.names):
+        states: list[dict[str, NDArray[Any]]] = []
+        picture: Picture = {"names": name}
+        for (task, _), metric in zip(walk.measured, empty, strict=True):
+            own = copy.deepcopy(metric)
+            seen = own.update(frame_truth(task, batch, slot), frame_of(found[task.name], slot))
+            states.append({key: np.asarray(value) for key, value in own.state().items()})
+            picture = {**seen, **picture}
+        if chosen is not None and chosen.takes(first + slot, picture):
+            picture["image"] = _picture(batch, slot)
+        else:
+            picture = {}
+        plain = {key: float(v) if isinstance(v, float) else v for key, v in picture.items()}
+        frames.append({"states": states, "picture": plain})
+    size = list(batch.image_B3HW.shape[2:])
+    return {"input": size, "truth": list(true_size(batch)), "frames": frames}
+
+
+class Candidates(Gallery):
+    """Which of a rank's frames the gallery of all frames may show."""
+
+    def takes(self, index: int, picture: Picture) -> bool:
+        """Whether it may show this frame, which is behind those that were asked for before.
+
+        Args:
+            index: its place in the split.
+        """
+        self._seen = index
+        self.add({key: v for key, v in picture.items() if not isinstance(v, np.ndarray)})
+        kept = [*self._chosen, *self._extremes]
+        return picture["names"] in [frame["names"] for frame in kept]
 
 
 # --- parts ----------------------------------------------------------------------------------------

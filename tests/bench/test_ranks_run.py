@@ -2,12 +2,15 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from support import slurm_node
@@ -64,6 +67,41 @@ def test_a_cell_on_two_ranks_is_the_cell(tmp_path):
     row = read_json(only(tmp_path, "row.json"))
     assert row["env"]["ranks"] == 2
     assert "done already" in run(tmp_path, *words)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+@pytest.mark.slow
+def test_labels_and_measures_of_a_checkpoint_are_those_of_one_rank(tmp_path):
+    """Of a trained cell without its row, and of the video stage after it."""
+    words = (*SMOKE, "--video", "--set", "recipe.data.val_scenes=19", "--device", "cpu")
+    run(tmp_path, *words, "--runs", "one")
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    (video,) = (path.parent for path in tmp_path.glob("two/*/pseudo_labels"))
+    (plain,) = (path for path in tmp_path.glob("two/*") if path.is_dir() and path != video)
+    shutil.rmtree(video)
+    (plain / "row.json").unlink()
+    said = run(tmp_path, *words, "--runs", "two", "--ranks", "2")
+    assert "continuing at step 6 of 6" in said
+    before, after = (tmp_path / runs / plain.name for runs in ("one", "two"))
+    one, two = (read_json(path / "row.json") for path in (before, after))
+    assert (one["env"]["ranks"], two["env"]["ranks"]) == (1, 2)
+    assert one["protocol"] == two["protocol"]
+    first, second = (
+        {k: v for k, v in r["metric"].items() if "latency" not in k} for r in (one, two)
+    )
+    assert len(first) > 20
+    assert json.dumps(second) == json.dumps(first)
+    pictures, others = (np.load(path / "samples.npz") for path in (before, after))
+    assert others.files == pictures.files
+    assert all(np.array_equal(others[key], pictures[key]) for key in pictures.files)
+    made, of_two = (contents(tmp_path / r / video.name / "pseudo_labels") for r in ("one", "two"))
+    assert len(made) == 1 + 2 * 16
+    assert of_two == made
+    assert read_json(video / "row.json")["protocol"]["pseudo_frames"] == 16
 
 
 @pytest.mark.slow
@@ -258,6 +296,69 @@ def test_a_killed_rank_ends_the_others_and_the_cell_goes_on(who, tmp_path):
     for key, value in expected.items():
         if ".running_" not in key:
             assert value.equal(model[key]), key
+
+
+def reached(place: Path, there: Callable[[], bool], *words: str) -> tuple[subprocess.Popen, int]:
+    """A run of two ranks once something is there, and the process of its second rank."""
+    process = begin(place, *words, "--device", "cpu", "--ranks", "2")
+    end = time.monotonic() + 400
+    while not there():
+        assert time.monotonic() < end, (place / "said").read_text()
+        time.sleep(0.1)
+    (second,) = followers(process)
+    return process, second
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("who", ["first", "second"])
+def test_a_rank_that_is_killed_in_the_evaluation_ends_the_other(who, tmp_path):
+    words = (*SMOKE, "--set", "recipe.data.val_scenes=200", "--set", "recipe.optim.steps=2")
+
+    def evaluates() -> bool:
+        told = tmp_path.glob("runs/*/progress.json")
+        return any('"stage": "evaluate"' in path.read_text() for path in told)
+
+    process, second = reached(tmp_path, evaluates, *words)
+    os.kill(process.pid if who == "first" else second, signal.SIGKILL)
+    code = ended(process, second)
+    cell = cell_of(tmp_path)
+    expected = (-signal.SIGKILL, "interrupted") if who == "first" else (1, "failed")
+    assert (code, store.status(cell, tmp_path / "runs")) == expected
+    said = run(tmp_path, *words, "--device", "cpu", "--ranks", "2")
+    assert "continuing at step 2 of 2" in said
+    assert store.status(cell, tmp_path / "runs") == "done"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("who", "number", "expected"),
+    [
+        ("first", signal.SIGTERM, 130),
+        ("second", signal.SIGTERM, 130),
+        ("second", signal.SIGKILL, 1),
+    ],
+)
+def test_labels_stay_when_a_rank_ends_among_them(who, number, expected, tmp_path):
+    """And the other one ends, too. Frames are large, for batches of eight."""
+    words = [*SMOKE, "--video", "--device", "cpu", "--set", "recipe.optim.steps=2"]
+    for setting in ("height=128", "width=256", "train_scenes=20", "val_scenes=1"):
+        words += ["--set", f"recipe.data.{setting}"]
+    words += ["--set", "recipe.pseudo.scales=[1.0, 1.5, 2.0]"]
+
+    def labels() -> bool:
+        return any(tmp_path.glob("runs/*/pseudo_labels/gtFine/*/*/*_instanceIds.png"))
+
+    process, second = reached(tmp_path, labels, *words)
+    os.kill(process.pid if who == "first" else second, number)
+    assert ended(process, second) == expected
+    folder = only(tmp_path, "pseudo_labels")
+    made = contents(folder)
+    said = run(tmp_path, *words, "--ranks", "2")
+    (line,) = (line for line in said.splitlines() if line.startswith("labelled"))
+    assert int(line.split()[1]) < 40
+    kept = contents(folder)
+    assert len(kept) == 1 + 2 * 40
+    assert all(kept[name] == text for name, text in made.items() if name in kept)
 
 
 @pytest.mark.cuda

@@ -36,6 +36,10 @@ class Thread(Ranks):
     def gather(self, value: Any) -> list[Any]:
         return [json.loads(text) for text in self._meeting.exchange(self.rank, json.dumps(value))]
 
+    def to_first(self, value: Any) -> list[Any]:
+        found = self._meeting.exchange(self.rank, value)
+        return found if self.first else []
+
     def sum_(self, tensor: Tensor) -> Tensor:
         brought = self._meeting.exchange(self.rank, tensor.detach().clone())
         with torch.no_grad():
