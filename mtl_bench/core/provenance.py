@@ -78,8 +78,15 @@ _MODEL = [
 ]
 # Where each stage of a cell begins in this package
 HARNESS_ROOTS = {
-    "train": [Root(of_package("train.loop"), ("train",)), *_MODEL],
-    "evaluate": [Root(of_package("evaluate.walk"), ("evaluate",)), *_MODEL],
+    "train": [
+        Root(of_package("train.loop"), ("train",)),
+        Root(of_package("evaluate.labels"), ("label",)),
+        *_MODEL,
+    ],
+    "evaluate": [
+        Root(of_package("evaluate.walk"), ("evaluate", "evaluate_together")),
+        *_MODEL,
+    ],
     "time": [Root(of_package("bench.stored"), ("time_cell",)), *_MODEL],
 }
 

@@ -163,7 +163,7 @@ def test_cagrad_where_gradients_cancel_goes_no_further_than_it_must():
     """No direction helps all: the best minimum is 0, reached inside of the ball."""
     J_KP = torch.tensor([[1.0, 0.0], [-0.9, 0.0], [0.0, 1.0]], **KIND)
     d_P = 1.16 * weigh("cagrad", J_KP, c=0.4) @ J_KP
-    assert d_P.tolist() == pytest.approx([0.0, 1 / 3], abs=1e-9)
+    assert d_P.tolist() == pytest.approx([0.0, 1 / 3], abs=1e-8)  # 2e-9 on some processors
 
 
 def test_cagrad_without_radius_is_the_mean():  # identity 10

@@ -268,10 +268,10 @@ NORMS = {
 
 def normalised(norm, ranks, x_B3HW, share, dtype=torch.float64):
     """Two passes, each with two ways back: outputs, gradients (this rank's) and state."""
-    torch.manual_seed(0)
+    draw = torch.Generator().manual_seed(0)  # of its own: ranks are threads here
     net = nn.Sequential(NORMS[norm]()).to(dtype)
     for parameter in net.parameters():
-        nn.init.normal_(parameter)
+        nn.init.normal_(parameter, generator=draw)
     found = []
     for factor in (1, 3):
         x = (x_B3HW[share] * factor).to(dtype).requires_grad_()
