@@ -210,18 +210,10 @@ class Processes(Ranks):
     def to_first(self, value: Any) -> list[Any]:
         import torch
 
-        packed = b"" if self.first else _packed(value)
-        lengths = self.gather(len(packed))
+        found = [None] * self.size if self.first else None
         with self._or_lost():
-            if not self.first:
-                torch.distributed.send(torch.frombuffer(bytearray(packed), dtype=torch.uint8), 0)
-                return []
-            found = [value]
-            for rank in range(1, self.size):
-                room = torch.empty(lengths[rank], dtype=torch.uint8)
-                torch.distributed.recv(room, rank)
-                found.append(_unpacked(room.numpy().tobytes()))
-        return found
+            torch.distributed.gather_object(value, found)
+        return found or []
 
     def sum_(self, tensor: "Tensor") -> "Tensor":
         import torch
@@ -450,40 +442,6 @@ def check_share(optim: "Optim", size: int) -> None:
             f"recipe.optim.micro_batch = {optim.micro_batch or 'none'} of recipe.optim.batch = "
             f"{optim.batch}; set micro_batch, or take a number of ranks that divides {parts}"
         )
-
-
-def _packed(value: Any) -> bytes:
-    """Plain values and arrays as bytes."""
-    import io
-
-    import numpy as np
-    import torch
-
-    def tensors(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: tensors(one) for key, one in value.items()}
-        if isinstance(value, list):
-            return [tensors(one) for one in value]
-        return torch.from_numpy(value.copy()) if isinstance(value, np.ndarray) else value
-
-    file = io.BytesIO()
-    torch.save(tensors(value), file)
-    return file.getvalue()
-
-
-def _unpacked(packed: bytes) -> Any:
-    import io
-
-    import torch
-
-    def arrays(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: arrays(one) for key, one in value.items()}
-        if isinstance(value, list):
-            return [arrays(one) for one in value]
-        return value.numpy() if torch.is_tensor(value) else value
-
-    return arrays(torch.load(io.BytesIO(packed), weights_only=True))
 
 
 def _line(error: BaseException) -> str:

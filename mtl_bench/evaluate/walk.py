@@ -204,12 +204,16 @@ def measure(
             done += len(batch.names)
             if progress:
                 progress(done, total)
-    metrics: dict[str, float] = {}
+    protocol = _protocol(cell, walks, input_size, sizes, device)
+    return Evaluation(_numbers(walks), protocol, gallery.samples())
+
+
+def _numbers(walks: Sequence[Walk]) -> dict[str, float]:
+    found: dict[str, float] = {}
     for walk in walks:
         for _, metric in walk.measured:
-            metrics |= metric.compute()
-    protocol = _protocol(cell, walks, input_size, sizes, device)
-    return Evaluation(metrics, protocol, gallery.samples())
+            found |= metric.compute()
+    return found
 
 
 def frame_truth(task: Task, batch: Batch, slot: int) -> dict[str, NDArray[Any]]:
@@ -344,12 +348,8 @@ def evaluate_together(
                         progress(done, total)
     if not ranks.first:
         return Evaluation({}, {})
-    metrics: dict[str, float] = {}
-    for walk in walks:
-        for _, metric in walk.measured:
-            metrics |= metric.compute()
     protocol = _protocol(cell, walks, input_size, sizes, device)
-    return Evaluation(metrics, protocol, gallery.samples())
+    return Evaluation(_numbers(walks), protocol, gallery.samples())
 
 
 def _seen(
