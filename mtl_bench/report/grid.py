@@ -365,8 +365,8 @@ def _published(source: Mapping[str, Any], axis: str) -> Section:
 
 
 def _records(results: Results) -> Iterator[dict[str, Any]]:
-    """A line per group: identity, kind, n, then mean and deviation of every column."""
-    every = known.columns()
+    """A line per group: identity, kind, n, then mean and deviation of each column that has some."""
+    every = [c for c in known.columns() if any(g.entries[c.name].count for g in results.lines)]
     of = {"recipe.name": results.problem} if results.problem else {}
     for group in results.lines:
         named = dict(zip(results.axes, group.identity, strict=True)) | of
@@ -379,7 +379,7 @@ def _records(results: Results) -> Iterator[dict[str, Any]]:
     for source in results.published:
         for row in source["rows"]:
             named = {results.axes[0]: row["name"], "kind": "published", "mark": source["mark"]}
-            found = [c for c in every if c.headline and c.name in row]
+            found = [c for c in (*headlines(), FPS) if c.name in row]
             found.sort(key=lambda c: bool(c.note))  # papers do not say what a note says of ours
             yield named | {c.name + "_published" * bool(c.note): row[c.name] for c in found}
     for cell in results.unfinished:
