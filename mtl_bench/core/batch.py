@@ -52,12 +52,10 @@ class Batch:
             fields={name: change(value) for name, value in self.fields.items()},
         )
 
-    def to(self, device: torch.device | str, channels_last: bool = False) -> Batch:
-        """A copy on a device; the image in channels-last memory where asked for."""
+    def to(self, device: torch.device | str) -> Batch:
+        """A copy on a device, its image in channels-last memory as the model's weights are."""
         moved = self.map(lambda value: value.to(device, non_blocking=True))
-        if channels_last:
-            image = moved.image_B3HW.contiguous(memory_format=torch.channels_last)
-            moved.image_B3HW = image
+        moved.image_B3HW = moved.image_B3HW.contiguous(memory_format=torch.channels_last)
         return moved
 
     def split(self, size: int) -> list[Batch]:

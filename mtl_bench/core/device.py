@@ -46,18 +46,16 @@ class Compute:
         self.scaler.scale(torch.zeros(1, device=self.device))  # it begins with the first such call
 
     @property
-    def channels_last(self) -> bool:
-        """The faster memory layout for convolutions on CUDA; slower here on the CPU."""
-        return self.device.type == "cuda"
-
-    @property
     def pinned(self) -> bool:
         """Whether batches should wait in page-locked memory: CUDA then copies beside the CPU."""
         return self.device.type == "cuda"
 
     def place(self, model: nn.Module) -> nn.Module:
-        layout = torch.channels_last if self.channels_last else torch.contiguous_format
-        found: nn.Module = model.to(self.device, memory_format=layout)  # type: ignore[call-overload]
+        """On the device, channels last: convolutions are faster so (on one core of a CPU a step of
+        the recipe `small` is, 1.07 to 1.38 times)."""
+        found: nn.Module = model.to(  # type: ignore[call-overload]
+            self.device, memory_format=torch.channels_last
+        )
         return found
 
     def autocast(self) -> AbstractContextManager[object]:

@@ -210,11 +210,10 @@ def measure(
     place = Compute(torch.device(device), precision)
     hosts, K_133 = prepare(images, camera.K_B33[0], latency, pin=place.pinned)
     seen = replace(camera, K_B33=K_133).map(lambda value: value.to(place.device))
-    layout = torch.channels_last if place.channels_last else torch.contiguous_format
 
     def transfer(host: Tensor) -> Tensor:
         image = host.to(place.device, non_blocking=True)
-        return image.to(torch.float32, memory_format=layout) / 255
+        return image.to(torch.float32, memory_format=torch.channels_last) / 255
 
     def network(image_13HW: Tensor) -> maps.Maps:
         with place.autocast():

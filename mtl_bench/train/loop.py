@@ -122,7 +122,7 @@ def train(
     def parts_of(batch: Batch, number: int) -> list[Forward]:
         """This rank's parts. Each of several draws what it draws from a seed of its own."""
         if together.one_batch:
-            own = batch.to(compute.device, compute.channels_last)
+            own = batch.to(compute.device)
             name = f"batch {number}"
             seeds = (
                 seed_for(cell.seed, purpose) for purpose in (f"{name} part {ranks.rank}", name)
@@ -133,7 +133,7 @@ def train(
         return [
             partial(
                 forward,
-                part.to(compute.device, compute.channels_last),
+                part.to(compute.device),
                 seed_for(cell.seed, f"batch {number} part {index}") if several else None,
             )
             for index, part in enumerate(split, before)

@@ -117,8 +117,9 @@ class FlowEncoder(nn.Module):
 
         def in_cells(x: Tensor) -> Tensor:  # means over windows of 2 x 2 cells, at every cell
             window = max(2 * self.CELL >> level, 3)
-            smooth = F.avg_pool2d(x, window - 1 + window % 2, 1, (window - 1) // 2)
-            return F.avg_pool2d(smooth, self.CELL >> level)
+            side, reach = window - 1 + window % 2, (window - 1) // 2
+            rows = F.avg_pool2d(x, (side, 1), 1, (reach, 0))  # one axis at a time is twice as fast
+            return F.avg_pool2d(F.avg_pool2d(rows, (1, side), 1, (0, reach)), self.CELL >> level)
 
         xx, xy, yy = in_cells(dx * dx), in_cells(dx * dy), in_cells(dy * dy)
         xt, yt = in_cells(dx * dt), in_cells(dy * dt)

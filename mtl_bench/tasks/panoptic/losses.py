@@ -22,9 +22,11 @@ def semantic_loss(
         target_BHW: class indices, 255 = no label.
         top_fraction: in (0, 1]; 1 keeps every valid pixel.
     """
-    loss_BHW = F.cross_entropy(logits_BCHW, target_BHW, ignore_index=IGNORE, reduction="none")
-    valid_BHW = (target_BHW != IGNORE) & (weight_BHW > 0)
-    loss_N, weight_N = loss_BHW[valid_BHW], weight_BHW[valid_BHW]
+    logits_NC = logits_BCHW.movedim(1, -1).flatten(0, 2)  # as they lie in memory, channels last
+    target_N, weight_N = target_BHW.flatten(), weight_BHW.flatten()
+    loss_N = F.cross_entropy(logits_NC, target_N, ignore_index=IGNORE, reduction="none")
+    valid_N = (target_N != IGNORE) & (weight_N > 0)
+    loss_N, weight_N = loss_N[valid_N], weight_N[valid_N]
     if not len(loss_N):
         return None
     k = max(1, round(top_fraction * len(loss_N)))
