@@ -1,4 +1,4 @@
-"""The light pose encoder's flow is the shift that the images have, and its network starts still."""
+"""The light pose encoder's flow is the shift that images have; its network starts forward."""
 
 import pytest
 import torch
@@ -57,6 +57,17 @@ def test_poses_follow_the_scales(encoder):
     transforms = moving(image, context)
     assert (transforms[..., :3, 3] == 0).all()
     assert (transforms[..., :3, :3] - torch.eye(3)).abs().max() > 1e-3
+
+
+def test_the_light_one_starts_with_a_camera_that_moves_forward():
+    torch.manual_seed(0)
+    pose = PoseNetwork("light", 16, scale=(0.01, 0.01)).eval()
+    grey_B3HW = torch.full((1, 3, 64, 128), 0.5)  # no flow: what is left is the start
+    moved_23 = pose(grey_B3HW, grey_B3HW.expand(2, -1, -1, -1)[None])[0, :, :3, 3].detach()
+    before, after = moved_23  # where the target's points are for the camera before, and after
+    assert before[2] == pytest.approx(0.01, abs=1e-3)
+    assert after[2] == pytest.approx(-0.01, abs=1e-3)
+    assert moved_23[:, :2].abs().max() < 1e-3
 
 
 def test_unknown_encoder():

@@ -5,6 +5,8 @@ Euler angles), scaled down so that training starts near the identity. Two encode
 ResNet-18, and a light one for small images and short trainings.
 """
 
+from typing import Any
+
 import timm
 import torch
 import torch.nn.functional as F
@@ -14,12 +16,15 @@ from mtl_bench.core.backbone import Backbone
 from mtl_bench.core.geometry import pose_from_vector
 from mtl_bench.model.layers import ConvNorm, Normalize, init_fan_in
 
+FORWARD = 2  # of a 6-vector, the translation along the optical axis
+
 
 class PoseNetwork(nn.Module):
     """Three frames -> the target camera's motion to each context camera.
 
     Args:
-        encoder: "resnet18" (the paper's, 11.2 M parameters) or "light" (see `FlowEncoder`).
+        encoder: "resnet18" (the paper's, 11.2 M parameters) or "light" (see `FlowEncoder`), with
+            which training starts from a camera that moves forward, by one unit of `scale` a frame.
         channels: hidden width of the decoder; the paper's 256.
         scale: factors on translation and rotation; the paper's 0.01 and 0.01.
         pretrained: start the ResNet-18 from timm's ImageNet weights, its first kernel repeated over
@@ -56,6 +61,9 @@ class PoseNetwork(nn.Module):
             nn.Conv2d(channels, 12, 1),
         )
         init_fan_in(self.decoder)
+        if encoder == "light":
+            last: Any = self.decoder[-1]
+            last.bias.data[[FORWARD, 6 + FORWARD]] = torch.tensor([1.0, -1.0])
 
     def forward(self, image_B3HW: Tensor, context_B23HW: Tensor) -> Tensor:
         """transform_B244: target-camera points -> points of the previous and the next camera."""
