@@ -330,13 +330,13 @@ def test_unknown_grid():
 
 
 IDS = [  # digests of all ids of a shipped grid, and of its smoke run: what was run is found by them
-    ("ablation", "8407fac9523f", "8093db8f83e2"),
-    ("ablation-controls", "0a43d0ed7bad", "91dd77aa3da9"),
-    ("backbones", "cb9cbb0e7c7c", "1d2d158a9724"),
+    ("ablation", "7983cb91ed16", "8093db8f83e2"),
+    ("ablation-controls", "5b7384aadf13", "91dd77aa3da9"),
+    ("backbones", "598dabcd4096", "1d2d158a9724"),
     ("kitti", "43149427a83e", "502da380f4d0"),
     ("latency", "a77fe8bc6487", "a266f7898b34"),
-    ("seeds", "c60e0723821a", "89cafecefdb1"),
-    ("weighting", "8ba903f551b6", "90b57b1a1c87"),
+    ("seeds", "5752590e4b2d", "89cafecefdb1"),
+    ("weighting", "3f296a0c58a1", "90b57b1a1c87"),
 ]
 
 
