@@ -32,7 +32,7 @@ def products(one: Sequence[Gradient], other: Sequence[Gradient]) -> Tensor:
 def _products(a_K: Gradient, b_L: Gradient) -> list[Tensor]:
     """Of one tensor of the space, in chunks: inside one in float32, over them in float64."""
     like = next(x for x in [*a_K, *b_L] if x is not None)
-    flat_K, flat_L = ([None if x is None else x.reshape(-1) for x in xs] for xs in (a_K, b_L))
+    flat_K, flat_L = ([None if x is None else _flat(x) for x in xs] for xs in (a_K, b_L))
     found = []
     chunk = CPU_CHUNK if like.device.type == "cpu" else like.numel()
     edges = [*range(0, like.numel(), chunk), like.numel()]
@@ -41,6 +41,11 @@ def _products(a_K: Gradient, b_L: Gradient) -> list[Tensor]:
         B_Lp = A_Kp if b_L is a_K else _stack(flat_L, like, start, end)
         found.append((A_Kp @ B_Lp.T).double())
     return found
+
+
+def _flat(x: Tensor) -> Tensor:
+    """Its numbers as channels-last memory has them: of what lies so, no copy."""
+    return (x.movedim(1, -1) if x.dim() == 4 else x).reshape(-1)
 
 
 def _stack(flat_K: Gradient, like: Tensor, start: int, end: int) -> Tensor:
