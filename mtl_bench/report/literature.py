@@ -433,7 +433,8 @@ def _details(group: Group, axes: Sequence[str], literature: Literature) -> str:
     said += [f"{tasks[0]} alone"] * (len(tasks) == 1)
     said += ["one network a task"] * bool(cell.get("single_task"))
     said += ["video stage"] * bool(cell.get("video"))
-    said += [f"replay {cell['replay']}"] * bool(cell.get("replay"))
+    if cell.get("replay"):
+        said.append(f"replay {cell['replay']}")
     if cell.get("pretrained"):
         said.append(f"weights {Path(cell['pretrained']).name}")
     said.append(f"recipe {cell.get('recipe.name')}")

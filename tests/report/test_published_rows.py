@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from mtl_bench.bench import references
 from mtl_bench.bench.grid import baseline_cell, load_grid
+from mtl_bench.bench.jobs import CELLS
 from mtl_bench.cli.app import app
 from mtl_bench.core import config
 from mtl_bench.report import literature
@@ -167,7 +168,7 @@ def row(method="mine", seed=0, factor=1.0, dataset="cityscapes-mtan", frames=500
         "status": "done",
         "seed": seed,
         "smoke": False,
-        "cell": config.to_dict(cell),
+        "cell": CELLS.identity(cell)["cell"],
         "metric": metric,
         "protocol": {"split": "test", "frames": frames, "published_frames": 500},
     }
