@@ -126,7 +126,10 @@ def measure(
     for name in names:
         group = {"base": base, "ours": our_step(bench, name)}
         if setting is not None and name in {*AGGREGATORS, *TWO_BATCH_WEIGHTINGS}:
-            group["torchjd"] = torchjd_step(bench, name, setting)
+            try:
+                group["torchjd"] = torchjd_step(bench, name, setting)
+            except ImportError as error:  # some of its solvers are extras
+                print(f"{name}: {error}", file=sys.stderr)
         groups.append(group)
         for step in group.values():
             seconds(bench, step)  # lazy initialisation
