@@ -1,10 +1,11 @@
 """The light pose encoder's flow is the shift that images have; its network starts forward."""
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
-from mtl_bench.tasks.depth.pose import FlowEncoder, PoseNetwork
+from mtl_bench.tasks.depth.pose import FlowEncoder, PoseNetwork, _windows
 
 
 def picture(height: int = 64, width: int = 128, grain: int = 8) -> torch.Tensor:
@@ -35,6 +36,16 @@ def test_flow_is_the_shift(level, right, down):
     torch.testing.assert_close(
         flow.median(2).values.median(2).values[0], expected, atol=0.12, rtol=0.2
     )
+
+
+@pytest.mark.parametrize(("cell", "side"), [(4, 7), (2, 3), (1, 3)])
+def test_windows_are_means_of_means(cell, side):
+    values = np.random.default_rng(0).random(22)
+    padded = np.pad(values, side // 2)
+    sliding = [padded[at : at + side].mean() for at in range(22)]
+    expected = [np.mean(sliding[at : at + cell]) for at in range(0, 22 - cell + 1, cell)]
+    weights = _windows(22, cell, torch.device("cpu"))
+    np.testing.assert_allclose(values @ weights.numpy(), expected, rtol=1e-6)
 
 
 def test_nothing_to_see_is_no_flow():

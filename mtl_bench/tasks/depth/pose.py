@@ -5,6 +5,7 @@ Euler angles), scaled down so that training starts near the identity. Two encode
 ResNet-18, and a light one for small images and short trainings.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import timm
@@ -123,11 +124,13 @@ class FlowEncoder(nn.Module):
         dy = (middle[..., 2:, 1:-1] - middle[..., :-2, 1:-1]) / 2
         dt = context - target
 
+        # A product an axis, in place of a pool for every pixel and a pool of those
+        down, right = (
+            _windows(length, self.CELL >> level, target.device) for length in target.shape[-2:]
+        )
+
         def in_cells(x: Tensor) -> Tensor:  # means over windows of 2 x 2 cells, at every cell
-            window = max(2 * self.CELL >> level, 3)
-            side, reach = window - 1 + window % 2, (window - 1) // 2
-            rows = F.avg_pool2d(x, (side, 1), 1, (reach, 0))  # one axis at a time is twice as fast
-            return F.avg_pool2d(F.avg_pool2d(rows, (1, side), 1, (0, reach)), self.CELL >> level)
+            return down.T @ x @ right
 
         xx, xy, yy = in_cells(dx * dx), in_cells(dx * dy), in_cells(dy * dy)
         xt, yt = in_cells(dx * dt), in_cells(dy * dt)
@@ -136,3 +139,12 @@ class FlowEncoder(nn.Module):
         u, v = (xy * yt - yy * xt) / determinant, (xy * xt - xx * yt) / determinant
         cells = 2**level / self.CELL
         return torch.cat([cells * u, cells * v, (xx + yy).sqrt()], 1)
+
+
+@lru_cache(maxsize=16)
+def _windows(length: int, cell: int, device: torch.device) -> Tensor:
+    """[length, length // cell]: takes the pixels of an axis to means over windows of about two
+    cells, averaged over every cell. Beyond the border there are zeros."""
+    window = max(2 * cell, 3)
+    side, reach = window - 1 + window % 2, (window - 1) // 2
+    return F.avg_pool1d(F.avg_pool1d(torch.eye(length)[None], side, 1, reach), cell)[0].to(device)
