@@ -14,7 +14,7 @@ from mtl_bench.core import config, geometry
 from mtl_bench.core.backbone import check_size
 from mtl_bench.core.batch import Batch, Camera, collate
 from mtl_bench.core.config import Cell, Recipe, load_recipe
-from mtl_bench.core.device import initial_weights
+from mtl_bench.core.device import Compute, initial_weights
 from mtl_bench.core.task import Task, tasks_of_cell
 from mtl_bench.data.samples import open_samples
 from mtl_bench.deploy import maps
@@ -101,7 +101,7 @@ def subject(
         hosts = [host.pin_memory() for host in hosts]
     origin = {"cell_id": cell.id, "slug": cell.slug, "recipe": cell.recipe.name}
     return Subject(
-        net=net.to(device),
+        net=Compute(device).place(net),
         backbone=cell.backbone,
         tasks=maps.tasks_of(net),
         images=hosts,

@@ -398,6 +398,15 @@ def test_work_of_a_network_is_that_of_its_convolutions(monkeypatch):
     assert roofline.share({"gmacs": 0.1, "network_mb": 20}, 100, 1, 40) == pytest.approx(0.5)
 
 
+def test_the_peak_is_the_faster_of_a_product_and_a_convolution(monkeypatch):
+    product, convolution = 2 * 2048**3, 2 * 9 * 512 * 512 * 32 * 64
+    for seconds, flops in (((1.0, 0.1, 2.0), 10 * convolution), ((1.0, 1.0, 2.0), product)):
+        taken = iter(seconds)
+        monkeypatch.setattr(roofline, "_fastest", lambda run, device, taken=taken: next(taken))
+        peaks = roofline.peaks(CPU, "fp32")
+        assert peaks == pytest.approx((flops / 1e9, 2**26 * 4 / 1e9))
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A network that has learned something: a quarter of the built-in recipe."""

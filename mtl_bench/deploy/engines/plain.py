@@ -3,6 +3,7 @@
 Source: torch, as in evaluation.
 """
 
+import torch
 from torch import Tensor, nn
 
 from mtl_bench.core.engine import Engine, Setting
@@ -17,7 +18,8 @@ class Plain(Engine):
 
     def transfer(self, image_BHW3: Tensor) -> Tensor:
         image_BHW3 = super().transfer(image_BHW3)
-        return image_BHW3.permute(0, 3, 1, 2).float().contiguous() / 255
+        image_B3HW = image_BHW3.permute(0, 3, 1, 2)
+        return image_B3HW.to(torch.float32, memory_format=torch.channels_last) / 255
 
     def run(self, image: Tensor) -> dict[str, Tensor]:
         return maps.of_outputs(self.net(image), self.tasks)
