@@ -34,8 +34,8 @@ def main() -> None:
         environment |= {"GOMP_SPINCOUNT": spin} if spin else {}
         words = [sys.executable, __file__, "--measure", "--steps", str(arguments.steps)]
         words += ["--rounds", str(arguments.rounds)]
-        output = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
-        alone, busy = json.loads(output.stdout.splitlines()[-1])
+        output = subprocess.check_output(words, env=environment, text=True)
+        alone, busy = json.loads(output.splitlines()[-1])
         name = spin or "default"
         ratio = busy / alone
         print(

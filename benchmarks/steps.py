@@ -107,7 +107,8 @@ def open_bench(
 
 def two_tasks(granularity: str, device: torch.device, name: str) -> Bench:
     recipe = load_recipe(name)
-    data = replace(recipe.data, train_scenes=16, val_scenes=4, frames=3)
+    frames = 2 * recipe.data.stride + 1
+    data = replace(recipe.data, train_scenes=16, val_scenes=4, frames=frames)
     cell = Cell(replace(recipe, data=data), "resnet18", BASE, granularity=granularity)
     model, method, _ = build(cell, Compute(device))
     model.train()

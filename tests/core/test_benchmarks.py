@@ -1,4 +1,4 @@
-"""The benchmarks still find what they import: nobody runs them often."""
+"""The benchmarks still find what they import and the recipe they time: nobody runs them often."""
 
 import os
 import subprocess
@@ -19,3 +19,15 @@ def test_a_benchmark_says_how_it_is_used(path):
     )
     assert done.returncode == 0, done.stderr
     assert path.name in IMPORTED or "usage:" in done.stdout
+
+
+def test_steps_are_those_of_the_default_recipe():
+    found = "b = steps.open_bench('tasks', torch.device('cpu')); steps.our_step(b, 'pcgrad')()"
+    done = subprocess.run(
+        [sys.executable, "-c", f"import torch, steps; {found}; print(b.cell.recipe.name)"],
+        cwd=FOLDER,
+        env=os.environ,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == "small\n", done.stderr
