@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
+from mtl_bench.bench.jobs import CELLS
 from mtl_bench.core import config
 
 GRID = SimpleNamespace(
@@ -39,13 +40,8 @@ def make_row(backbone="resnet18", seed=0, smoke=False, status="done", metric=Non
         "latency.threads": 2,
     }
     return {
-        "slug": cell.slug,
+        **CELLS.identity(cell),
         "status": status,
-        "backbone": backbone,
-        "method": cell.method,
-        "seed": seed,
-        "smoke": smoke,
-        "cell": config.to_dict(cell),
         "metric": {**values, **(metric or {})},
         "protocol": {"split": "val", "depth_range_m": [0.001, 80.0]},
         "time": {"train_s": 120.0},

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 from fake_rows import make_row
 
+from mtl_bench.bench.jobs import CELLS
 from mtl_bench.bench.tuning import Trial, Tried
 from mtl_bench.core import config
 from mtl_bench.report.delta import with_delta
@@ -92,5 +93,5 @@ def fail(row):
 def _row(recipe, method, seed):
     row = make_row(f"net_{recipe}", seed, method=method)
     cell = config.Cell(config.Recipe(name=recipe), f"net_{recipe}", method, seed=seed)
-    row |= {"metric": {}, "slug": f"{recipe}-{method}-s{seed}", "cell": config.to_dict(cell)}
+    row |= {"metric": {}, **CELLS.identity(cell), "slug": f"{recipe}-{method}-s{seed}"}
     return row
