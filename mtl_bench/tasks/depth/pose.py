@@ -125,9 +125,8 @@ class FlowEncoder(nn.Module):
         dt = context - target
 
         # A product an axis, in place of a pool for every pixel and a pool of those
-        down, right = (
-            _windows(length, self.CELL >> level, target.device) for length in target.shape[-2:]
-        )
+        cell, kind, device = self.CELL >> level, target.dtype, target.device
+        down, right = (_windows(length, cell, kind).to(device) for length in target.shape[-2:])
 
         def in_cells(x: Tensor) -> Tensor:  # means over windows of 2 x 2 cells, at every cell
             return down.T @ x @ right
@@ -142,9 +141,10 @@ class FlowEncoder(nn.Module):
 
 
 @lru_cache(maxsize=16)
-def _windows(length: int, cell: int, device: torch.device) -> Tensor:
+def _windows(length: int, cell: int, dtype: torch.dtype) -> Tensor:
     """[length, length // cell]: takes the pixels of an axis to means over windows of about two
     cells, averaged over every cell. Beyond the border there are zeros."""
     window = max(2 * cell, 3)
     side, reach = window - 1 + window % 2, (window - 1) // 2
-    return F.avg_pool1d(F.avg_pool1d(torch.eye(length)[None], side, 1, reach), cell)[0].to(device)
+    pixels = torch.eye(length, dtype=dtype)[None]
+    return F.avg_pool1d(F.avg_pool1d(pixels, side, 1, reach), cell)[0]
