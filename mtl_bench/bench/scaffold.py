@@ -108,7 +108,7 @@ from mtl_bench.deploy.graph import GraphEngine, strided
 class {title}(GraphEngine):
     """The graph, run by torch."""
 
-    precisions = {{"cpu": ("fp32",), "cuda": ("fp32",)}}  # by kind of device: fp32, bf16, fp16
+    precisions = {{"cpu": ("fp32",), "cuda": ("fp32",)}}  # by kind of device; also bf16, fp16, int8
     # packages = ("mine",)  # that `build` imports, where it is more than torch
     # extra = ("mine>=1.0",)  # what to pip install where they are missing
 

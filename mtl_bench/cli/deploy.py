@@ -71,7 +71,8 @@ def latency(
         ),
     ] = "plain",
     precision: Annotated[
-        str, typer.Option(metavar="NAME|all", help="fp32, bf16 or fp16; all: with --engine all.")
+        str,
+        typer.Option(metavar="NAME|all", help="fp32, bf16, fp16, int8; all: with --engine all."),
     ] = "fp32",
     passes: Annotated[int, typer.Option(min=1, help="Timed ones, over distinct images.")] = 500,
     seconds: Annotated[
@@ -119,12 +120,18 @@ def latency(
     from mtl_bench.core import provenance
     from mtl_bench.core.device import choose_device
     from mtl_bench.deploy import timer
-    from mtl_bench.deploy.subject import subject
+    from mtl_bench.deploy.subject import EXAMPLES, subject
 
     chosen = choose_device(device.value)
     torch.set_num_threads(threads or provenance.cores())
     what = subject(
-        cell, model, size=o.size(size), data=root, device=chosen, trained=checkpoint is not None
+        cell,
+        model,
+        size=o.size(size),
+        data=root,
+        device=chosen,
+        trained=checkpoint is not None,
+        examples=EXAMPLES if precision == "int8" else 0,
     )
     plan = timer.Plan(passes, seconds, batch, threads or provenance.cores())
     row = timer.row(what, engine, precision, chosen, plan)

@@ -6,7 +6,7 @@ One engine a file; its name is the file's. Many engines run one and the same gra
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
@@ -15,10 +15,17 @@ from torch import Tensor, nn
 from mtl_bench.core import plugins
 from mtl_bench.core.device import DTYPES
 
+PRECISIONS = {**DTYPES, "int8": torch.int8}  # what networks can run in, and its numbers' type
+
 
 @dataclass(frozen=True)
 class Setting:
-    """What an engine is made for; its graph has this fixed size."""
+    """What an engine is made for; its graph has this fixed size.
+
+    Attributes:
+        examples: uint8 [1,H,W,3] images of the training split, for int8: what is measured on them
+            is the range of every map.
+    """
 
     batch: int
     height: int  # pixels
@@ -26,6 +33,7 @@ class Setting:
     precision: str
     device: torch.device
     threads: int
+    examples: tuple[Tensor, ...] = field(default=(), compare=False, repr=False)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -33,7 +41,7 @@ class Setting:
 
     @property
     def dtype(self) -> torch.dtype:
-        return DTYPES[self.precision]
+        return PRECISIONS[self.precision]
 
 
 class Engine(ABC):
@@ -47,7 +55,7 @@ class Engine(ABC):
         setting: what the engine is made for.
     """
 
-    precisions: ClassVar[Mapping[str, tuple[str, ...]]]  # kind of device -> fp32, bf16, fp16
+    precisions: ClassVar[Mapping[str, tuple[str, ...]]]  # kind of device -> some of PRECISIONS
     packages: ClassVar[tuple[str, ...]] = ("torch",)  # it imports; the first's version is in rows
     extra: ClassVar[tuple[str, ...]] = ()  # what to pip install where one of them is lacking
 

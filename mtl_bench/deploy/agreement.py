@@ -22,12 +22,13 @@ LIMITS = {  # precision -> least share of equal ids' pixels, largest median of a
     "fp32": (0.999, 1e-3),
     "fp16": (0.99, 5e-3),
     "bf16": (0.95, 2e-2),  # 8 bits of mantissa: 0.4 % a rounding
+    "int8": (0.95, 2e-2),  # of whoever would take bf16
 }
 # Of random weights classes and centers all but tie, so that pixels say little: the maps are judged,
 # by the root mean square of their difference over their own deviation. Measured on the four shipped
 # backbones, 512x1024, in part 1024x2048: fp32 up to 4e-5, fp16 0.014 (ResNet18's inverse depth 0.1:
 # beyond the limit), bf16 0.08; red and blue exchanged, logits alone, 0.14 to 0.25.
-RANDOM = {"fp32": 1e-3, "fp16": 0.05, "bf16": 0.1}
+RANDOM = {"fp32": 1e-3, "fp16": 0.05, "bf16": 0.1, "int8": 0.1}
 EQUAL, MEDIAN = "_equal", "_median_rel"  # ends of measures
 RMS = "agreement.maps_rms"
 

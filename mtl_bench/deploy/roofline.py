@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from mtl_bench.core.device import DTYPES
+from mtl_bench.core.engine import PRECISIONS
 from mtl_bench.deploy.graph import Body
 
 TRIES = 5
@@ -38,7 +38,7 @@ def work(net: nn.Module, shape: tuple[int, int, int], precision: str) -> dict[st
         body = Body(copy.deepcopy(net).to("meta"))
         image_B3HW = torch.empty(shape[0], 3, *shape[1:], device="meta")
         counted, seen = _count(lambda: body(image_B3HW))
-    return counted | {"network_mb": seen.traffic * DTYPES[precision].itemsize / 1e6}
+    return counted | {"network_mb": seen.traffic * PRECISIONS[precision].itemsize / 1e6}
 
 
 def cost(stages: Sequence[Stage], host: Tensor, device: torch.device) -> dict[str, float | str]:
@@ -151,17 +151,19 @@ def _tensors_in(value: Any) -> Iterator[Tensor]:
 def peaks(device: torch.device, precision: str) -> tuple[float, float]:
     """Measured: GFLOP/s in the precision of a large matrix product or 3 x 3 convolution, whichever
     is faster, and GB/s of a large copy. On a CPU different libraries compute the two: MKL's product
-    reaches half of what oneDNN's convolution does on an AMD processor."""
-    dtype = DTYPES[precision]
+    reaches half of what oneDNN's convolution does on an AMD processor. torch has a product in int8,
+    and no convolution."""
+    dtype = PRECISIONS[precision]
     side, images, floats = MATMUL[device.type], CONVOLVED[device.type], COPY[device.type]
     a, b = (torch.rand(side, side, device=device).to(dtype) for _ in range(2))
-    x = torch.rand(images, 512, 32, 64, device=device).to(dtype)
-    weight = torch.rand(512, 512, 3, 3, device=device).to(dtype)
-    x, weight = (tensor.contiguous(memory_format=torch.channels_last) for tensor in (x, weight))
-    flops = max(
-        2 * side**3 / _fastest(lambda: a @ b, device),
-        2 * 9 * x.numel() * len(weight) / _fastest(lambda: F.conv2d(x, weight, padding=1), device),
-    )
+    product = torch._int_mm if dtype is torch.int8 else torch.mm
+    flops = 2 * side**3 / _fastest(lambda: product(a, b), device)
+    if dtype.is_floating_point:
+        x = torch.rand(images, 512, 32, 64, device=device).to(dtype)
+        weight = torch.rand(512, 512, 3, 3, device=device).to(dtype)
+        x, weight = (one.contiguous(memory_format=torch.channels_last) for one in (x, weight))
+        convolved = 2 * 9 * x.numel() * len(weight)
+        flops = max(flops, convolved / _fastest(lambda: F.conv2d(x, weight, padding=1), device))
     source = torch.rand(floats, device=device)
     target = torch.empty_like(source)
     moved = 2 * 4 * floats / _fastest(lambda: target.copy_(source), device)

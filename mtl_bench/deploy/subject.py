@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from mtl_bench.deploy.maps import Last
 from mtl_bench.model import Model, build_model
 
 IMAGES = 50  # distinct ones
+EXAMPLES = 16  # for int8
 BUILT_IN = "small"  # recipe of the built-in frames that stand in where no data set is given
 SEED = 0
 
@@ -34,6 +35,7 @@ class Subject:
         net: a model's `net` in evaluation mode.
         images: uint8 [1,H,W,3] each, as a camera delivers them, all of one size.
         trained: cell_id, slug and recipe of the run that the weights are of; None: random ones.
+        examples: images of the training split, for engines in int8; none where it is not asked for.
     """
 
     net: nn.Module
@@ -42,6 +44,7 @@ class Subject:
     images: list[Tensor]
     camera: Camera
     trained: dict[str, Any] | None
+    examples: list[Tensor] = field(default_factory=list)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -74,25 +77,31 @@ def subject(
     device: torch.device,
     trained: bool,
     images: int = IMAGES,
+    examples: int = 0,
 ) -> Subject:
-    """A network and the evaluation split's first frames at a size.
+    """A network and the first frames at a size: of the evaluation split, and `examples` of the
+    training split.
 
     Raises:
         ValueError: a size that the network cannot take.
     """
     check_size(cell, size, "--size")
-    split = cell.recipe.evaluate.images
-    looks = open_samples(cell.recipe, (), split, data, training=False)  # at images, not at labels
-    samples = [looks.sample(n, None) for n in range(min(images, len(looks)))]
-    camera = collate(samples[:1]).camera
-    assert camera is not None
-    hosts, K_133 = prepare(
-        (sample.image_B3HW for sample in samples),
-        camera.K_B33[0],
-        config.Latency(passes=images, height=size[0], width=size[1]),
-        pin=False,
-    )
-    hosts = [host.permute(0, 2, 3, 1).contiguous() for host in hosts]
+
+    def first(split: str, count: int) -> tuple[list[Tensor], Camera]:
+        looks = open_samples(cell.recipe, (), split, data, training=False)  # at images alone
+        samples = [looks.sample(n, None) for n in range(min(count, len(looks)))]
+        camera = collate(samples[:1]).camera
+        assert camera is not None
+        found, K_133 = prepare(
+            (sample.image_B3HW for sample in samples),
+            camera.K_B33[0],
+            config.Latency(passes=count, height=size[0], width=size[1]),
+            pin=False,
+        )
+        hosts = [host.permute(0, 2, 3, 1).contiguous() for host in found]
+        return hosts, replace(camera, K_B33=K_133)
+
+    hosts, camera = first(cell.recipe.evaluate.images, images)
     net = model.net.eval()
     if not trained:
         (network,) = maps.networks_of(net)
@@ -105,8 +114,9 @@ def subject(
         backbone=cell.backbone,
         tasks=maps.tasks_of(net),
         images=hosts,
-        camera=replace(camera, K_B33=K_133),
+        camera=camera,
         trained=origin if trained else None,
+        examples=first("train", examples)[0] if examples else [],
     )
 
 

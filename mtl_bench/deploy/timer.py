@@ -313,7 +313,7 @@ def build(kind: type[Engine], subject: Subject, setting: Setting) -> Engine:
     if setting.device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # fp32 means float32
     with torch.inference_mode(False):  # an exporter keeps weights, which must be ordinary tensors
-        return kind(subject.net, setting)
+        return kind(subject.net, replace(setting, examples=tuple(subject.examples)))
 
 
 def compare(subject: Subject, engine: Engine, images: int = COMPARED) -> Agreement:

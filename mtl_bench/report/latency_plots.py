@@ -22,7 +22,7 @@ from mtl_bench.report.statistics import SMOKE
 if TYPE_CHECKING:
     from mtl_bench.report.latency import Line, Timings
 
-FILLS = {"fp32": "full", "bf16": "left", "fp16": "none"}
+FILLS = {"fp32": "full", "bf16": "left", "fp16": "none", "int8": "bottom"}
 STAGES = (
     ("transfer_ms", "transfer"),
     ("network_ms", "network"),

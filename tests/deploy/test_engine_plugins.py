@@ -145,7 +145,7 @@ def test_a_wrong_engine_is_caught(put, line, caught):
 
 
 def test_an_unknown_precision_is_caught_and_a_lacking_package_is_said(put):
-    put(declared='precisions = {"cpu": ("int8",)}\n    packages = ("nowhere",)')
+    put(declared='precisions = {"cpu": ("int4",)}\n    packages = ("nowhere",)')
     plugins.add_folder("mine")
     results = {result.name: result for result in check("engines", "myengine")}
     assert "known: fp32" in results["declared"].detail

@@ -6,6 +6,7 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from mtl_bench.bench import stored
 from mtl_bench.core.engine import Setting
 from mtl_bench.core.recipe import Recipe
 from mtl_bench.data import scenes as synthetic
+from mtl_bench.data.samples import open_samples
 from mtl_bench.deploy import agreement, engines, roofline, timer
 from mtl_bench.deploy import subject as subjects
 from mtl_bench.deploy.graph import NORM, Body, Upsample, fold, strided
@@ -166,6 +168,41 @@ def test_openvino_computes_in_float32_where_fp32_was_asked_for():
     with torch.inference_mode():
         found = timer.compare(what, timer.make(what, "openvino", setting()))
     assert found.values()["agreement.logits_max"] < 1e-3  # bf16, its default on AMX: 0.01
+
+
+def int8(examples: list[Tensor]) -> agreement.Agreement:
+    what = replace(subject("resnet18"), examples=examples)
+    with torch.inference_mode():
+        return timer.compare(what, timer.make(what, "openvino", setting("int8")))
+
+
+def test_int8_takes_its_ranges_from_the_examples():
+    pytest.importorskip("nncf")
+    found = int8(images(3))
+    assert found.wrong("int8", trained=False) == ""
+    assert found.maps_rms > 1e-3  # float32: 1e-5
+    black = int8([torch.zeros_like(image) for image in images(3)])
+    assert "of their deviation" in black.wrong("int8", trained=False)
+
+
+def test_int8_without_a_batch_of_examples_is_refused():
+    pytest.importorskip("nncf")
+    row = timer.row(subject(), "openvino", "int8", CPU, PLAN)
+    assert row["status"] == "failed"
+    assert "int8 needs 1 images of the training split or more, and there are 0" in row["why"]
+
+
+def test_examples_are_of_the_training_split():
+    cell, weights = subjects.untrained("tiny", "smoke", TASKS)
+    data = cell.recipe.data
+    root = synthetic.ensure(data)
+    size = data.height, data.width
+    what = subjects.subject(cell, weights, size, root, CPU, False, images=2, examples=3)
+    train = open_samples(cell.recipe, (), "train", root, training=False)
+    assert len(what.examples) == 3
+    for number, example_1HW3 in enumerate(what.examples):
+        expected_3HW = (train.sample(number, None).image_B3HW * 255).round()
+        assert torch.equal(example_1HW3[0].permute(2, 0, 1).float(), expected_3HW.float())
 
 
 def test_a_precision_that_an_engine_lacks_says_what_it_has():
@@ -407,6 +444,17 @@ def test_the_peak_is_the_faster_of_a_product_and_a_convolution(monkeypatch):
         assert peaks == pytest.approx((flops / 1e9, 2**26 * 4 / 1e9))
 
 
+def test_the_peak_in_int8_is_that_of_a_product(monkeypatch):
+    monkeypatch.setattr(roofline, "MATMUL", {"cpu": 64})
+
+    def once(run, device):
+        run()
+        return 1.0
+
+    monkeypatch.setattr(roofline, "_fastest", once)
+    assert roofline.peaks(CPU, "int8")[0] == pytest.approx(2 * 64**3 / 1e9)
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A network that has learned something: a quarter of the built-in recipe."""
@@ -427,3 +475,14 @@ def test_trained_weights_over_the_val_split(name, trained):
     with torch.inference_mode():
         result = timer.compare(what, timer.make(what, name, setting()), 20)
     assert result.wrong("fp32") == ""
+
+
+@pytest.mark.slow
+def test_int8_of_trained_weights(trained):
+    pytest.importorskip("nncf")
+    cell, weights = stored.deployed(trained, None)
+    root = synthetic.ensure(cell.recipe.data)
+    what = subjects.subject(cell, weights, SIZE, root, CPU, True, images=20, examples=16)
+    with torch.inference_mode():
+        result = timer.compare(what, timer.make(what, "openvino", setting("int8")), 20)
+    assert result.wrong("int8") == ""

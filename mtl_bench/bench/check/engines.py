@@ -11,8 +11,8 @@ from mtl_bench.core.backbone import Backbone
 from mtl_bench.core.batch import Camera
 from mtl_bench.core.config import load_recipe
 from mtl_bench.core.dataset import dataset_of
-from mtl_bench.core.device import DTYPES, choose_device
-from mtl_bench.core.engine import Engine, Setting
+from mtl_bench.core.device import choose_device
+from mtl_bench.core.engine import PRECISIONS, Engine, Setting
 from mtl_bench.core.task import tasks_of
 from mtl_bench.deploy import engines, timer
 from mtl_bench.deploy.maps import CLASS, infos
@@ -63,11 +63,13 @@ def subject(device: torch.device) -> Subject:
     fine_B3HW = nn.functional.interpolate(coarse_B3hw, SIZE, mode="bicubic").clamp(0, 1)
     images_BHW3 = (fine_B3HW * 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
     K_133 = torch.tensor([[[115.0, 0, 63.5], [0, 115, 31.5], [0, 0, 1]]])
+    images = list(images_BHW3.split(1))
     return Subject(
         net=net.to(device),
         backbone="",
         tasks=tasks,
-        images=list(images_BHW3.split(1)),
+        images=images,
+        examples=images,
         camera=Camera(K_133, torch.tensor([1.4]), torch.zeros(1)),
         trained=None,
     )
@@ -101,8 +103,10 @@ def _here(check: Callable[[type[Engine], str], str | None]) -> Callable[[type[En
 
 def _declared(kind: type[Engine]) -> None:
     for device, precisions in kind.precisions.items():
-        if device not in ("cpu", "cuda") or not precisions or not set(precisions) <= set(DTYPES):
-            raise ValueError(f"precisions of {device}: {precisions} (known: {', '.join(DTYPES)})")
+        unknown = set(precisions) - set(PRECISIONS)
+        if device not in ("cpu", "cuda") or not precisions or unknown:
+            known = ", ".join(PRECISIONS)
+            raise ValueError(f"precisions of {device}: {precisions} (known: {known})")
     if not kind.precisions or not kind.packages:
         raise ValueError("an engine has precisions, and a package whose version stands in rows")
 
