@@ -12,7 +12,12 @@ from mtl_bench.core.batch import Batch, Camera
 from mtl_bench.core.task import Maps, tasks_of, terms_of
 from mtl_bench.data.labels import CITYSCAPES20
 from mtl_bench.model import Model, Outputs
-from mtl_bench.tasks.depth.losses import PhotometricError, photometric_loss, smoothness_loss
+from mtl_bench.tasks.depth.losses import (
+    PhotometricError,
+    hint_error,
+    photometric_loss,
+    smoothness_loss,
+)
 from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_loss
 
 F64 = torch.float64
@@ -121,7 +126,11 @@ class Scene:
         return image.unflatten(-1, self.shape[2:]), depth.unflatten(-1, self.shape[2:])
 
     def loss(
-        self, inverse: Tensor | None = None, automask: bool = False, **changed: Tensor
+        self,
+        inverse: Tensor | None = None,
+        automask: bool = False,
+        hints: float = 0.0,
+        **changed: Tensor,
     ) -> Tensor:
         frames = {"context_BN3HW": self.context, "transforms_BN44": self.transforms} | changed
         return photometric_loss(
@@ -130,6 +139,7 @@ class Scene:
             K_B33=self.K,
             **{"mask_BHW": self.mask} | frames,
             automask=automask,
+            hints=hints,
         )
 
 
@@ -281,6 +291,50 @@ def test_a_tie_goes_to_the_unwarped_frame() -> None:
         loss = photometric_loss(target, context, [one], K, mask, still, automask=automask)
         (grad,) = torch.autograd.grad(loss, still)
         assert bool((grad == 0).all()) == automask
+
+
+# --- hints ----------------------------------------------------------------------------------------
+
+
+def hint_gradient(scene: Scene, factor: float) -> Tensor:
+    """Of the hints' part of the loss, with respect to the logarithm of a depth so many times too
+    far: positive where a nearer one is better."""
+    log = (scene.depth * factor).log().requires_grad_()
+    with_hints, without = (
+        scene.loss((-log).exp(), hints=weight, automask=False) for weight in (2.0, 0.0)
+    )
+    (grad,) = torch.autograd.grad(with_hints - without, log)
+    return grad
+
+
+@pytest.mark.parametrize(("factor", "sign"), [(1.3, 1), (0.75, -1)])
+def test_hints_lead_to_the_true_depth_with_equal_strength_near_and_far(factor, sign) -> None:
+    grad = hint_gradient(Scene(batch=4), factor)
+    found = grad[grad != 0].abs()
+    torch.testing.assert_close(found, torch.full_like(found, float(found[0])))
+    assert (grad.sign() == sign).double().mean() > 0.8
+
+
+def test_hints_leave_the_true_depth_alone() -> None:
+    assert hint_gradient(Scene(batch=4), 1.0).sign().abs().mean() < 0.02
+
+
+def test_hint_error_is_the_distance_to_the_better_of_two_depths() -> None:
+    torch.manual_seed(5)
+    depth = 1 + torch.rand(2, 1, 3, 4)
+    own, farther, nearer = torch.rand(3, 2, 3, 4)
+    nearer[0, 0, 0] = torch.inf
+
+    def rebuilt(tried: Tensor) -> tuple[Tensor, Tensor]:
+        step = (tried / depth).log().flatten(1)
+        torch.testing.assert_close(step.abs(), torch.tensor([[0.2], [0.4]]).expand(2, 12))
+        return farther if (step > 0).all() else nearer, torch.ones(2, 3, 4, dtype=torch.bool)
+
+    found = hint_error(depth, own, rebuilt)
+    for b, step in enumerate((0.2, 0.4)):
+        better = torch.minimum(farther[b], nearer[b]) < own[b]
+        torch.testing.assert_close(found[b], step * better.float())
+    assert 0 < (found > 0).double().mean() < 1
 
 
 # --- smoothness -----------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ Shapes: S scales, B samples, N neighbouring frames, H x W pixels. Images are RGB
 colour jitter.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -25,6 +25,7 @@ def photometric_loss(
     *,
     ssim_weight: float = 0.85,
     automask: bool = True,
+    hints: float = 0.0,
 ) -> Tensor | None:
     """Smallest error per pixel among the warped context frames, averaged over pixels and scales.
 
@@ -46,6 +47,7 @@ def photometric_loss(
         inverse_SB1HW: one inverse depth a scale, all at full resolution.
         transforms_BN44: take points from the target's camera to each context frame's.
         mask_BHW: bool, False on sky, ego vehicle and padding.
+        hints: weight of `hint_error`.
     """
     inside_BHW = _erode(mask_BHW)
     error_of = PhotometricError(target_B3HW, ssim_weight)
@@ -54,9 +56,9 @@ def photometric_loss(
     if automask:
         with torch.no_grad():
             unwarped_BHW = torch.stack([error_of(frame_B3HW) for frame_B3HW in contexts]).amin(0)
-    total, scales = target_B3HW.new_zeros(()), target_B3HW.new_zeros((), dtype=torch.int64)
-    for inverse_B1HW in inverse_SB1HW:
-        depth_B1HW = geometry.depth_from_inverse(inverse_B1HW)
+
+    def rebuilt(depth_B1HW: Tensor) -> tuple[Tensor, Tensor]:
+        """Error [B,H,W] of the best warped frame, infinite where none is in view; where one is."""
         errors, valids = [], []
         # one image at a time: on a CPU this is faster than one big call, as the cache holds it
         for frame_B3HW, transform_B44 in zip(contexts, transforms_BN44.unbind(1), strict=True):
@@ -65,14 +67,52 @@ def photometric_loss(
             )
             valids.append(valid_B1HW.squeeze(1))
             errors.append(error_of(warped_B3HW).masked_fill(~valids[-1], torch.inf))
-        error_BHW = torch.stack(errors).amin(0)
+        return torch.stack(errors).amin(0), torch.stack(valids).any(0)
+
+    total, scales = target_B3HW.new_zeros(()), target_B3HW.new_zeros((), dtype=torch.int64)
+    for inverse_B1HW in inverse_SB1HW:
+        depth_B1HW = geometry.depth_from_inverse(inverse_B1HW)
+        error_BHW, seen_BHW = rebuilt(depth_B1HW)
         if unwarped_BHW is not None:
             error_BHW = torch.where(error_BHW < unwarped_BHW, error_BHW, unwarped_BHW)
-        counts_BHW = torch.stack(valids).any(0) & inside_BHW
+        if hints:
+            error_BHW = error_BHW + hints * hint_error(depth_B1HW, error_BHW, rebuilt)
+        counts_BHW = seen_BHW & inside_BHW
         number = counts_BHW.sum()
         total = total + error_BHW.masked_fill(~counts_BHW, 0).sum() / number.clamp(min=1)
         scales += number > 0
     return total / int(scales) if scales > 0 else None
+
+
+REACH = 0.4  # of the logarithm of depth, of the farthest hint
+
+
+def hint_error(
+    depth_B1HW: Tensor, error_BHW: Tensor, rebuilt: Callable[[Tensor], tuple[Tensor, Tensor]]
+) -> Tensor:
+    """How far the logarithm of depth is from that of a better depth, where one is found: [B,H,W].
+
+    The photometric error hardly tells far from very far: the flow of a far pixel is small, and so
+    is its gradient. Which of two depths rebuilds a pixel better is as clear there as it is near. So
+    the depth of each sample is tried once farther and once nearer by one factor, from small ones at
+    the batch's first sample to exp(REACH) at its last, and where one of them is better, it is a
+    label. After Watson et al., "Self-supervised monocular depth hints" (ICCV 2019), whose hints are
+    found by stereo matching.
+
+    Args:
+        error_BHW: of the depth.
+        rebuilt: error [B,H,W] of another depth, infinite out of view; and where it is in view.
+    """
+    log_BHW = depth_B1HW.log().squeeze(1)
+    with torch.no_grad():
+        count = len(depth_B1HW)
+        step_B11 = torch.linspace(REACH / count, REACH, count).to(depth_B1HW)[:, None, None]
+        factor_B111 = step_B11.exp().unsqueeze(1)
+        farther_BHW, _ = rebuilt(depth_B1HW * factor_B111)
+        nearer_BHW, _ = rebuilt(depth_B1HW / factor_B111)
+        hint_BHW = log_BHW + torch.where(farther_BHW < nearer_BHW, step_B11, -step_B11)
+        better_BHW = torch.minimum(farther_BHW, nearer_BHW) < error_BHW
+    return (log_BHW - hint_BHW).abs() * better_BHW
 
 
 def _erode(mask_BHW: Tensor) -> Tensor:
