@@ -25,6 +25,7 @@ def photometric_loss(
     *,
     ssim_weight: float = 0.85,
     automask: bool = True,
+    softness: float = 0.0,
     hints: float = 0.0,
 ) -> Tensor | None:
     """Smallest error per pixel among the warped context frames, averaged over pixels and scales.
@@ -47,6 +48,7 @@ def photometric_loss(
         inverse_SB1HW: one inverse depth a scale, all at full resolution.
         transforms_BN44: take points from the target's camera to each context frame's.
         mask_BHW: bool, False on sky, ego vehicle and padding.
+        softness: of the minimum over warped frames, see `soft_minimum`; 0: the smallest counts.
         hints: weight of `hint_error`.
     """
     inside_BHW = _erode(mask_BHW)
@@ -58,7 +60,7 @@ def photometric_loss(
             unwarped_BHW = torch.stack([error_of(frame_B3HW) for frame_B3HW in contexts]).amin(0)
 
     def rebuilt(depth_B1HW: Tensor) -> tuple[Tensor, Tensor]:
-        """Error [B,H,W] of the best warped frame, infinite where none is in view; where one is."""
+        """Error [B,H,W] of the warped frames, infinite where none is in view; and where one is."""
         errors, valids = [], []
         # one image at a time: on a CPU this is faster than one big call, as the cache holds it
         for frame_B3HW, transform_B44 in zip(contexts, transforms_BN44.unbind(1), strict=True):
@@ -67,7 +69,9 @@ def photometric_loss(
             )
             valids.append(valid_B1HW.squeeze(1))
             errors.append(error_of(warped_B3HW).masked_fill(~valids[-1], torch.inf))
-        return torch.stack(errors).amin(0), torch.stack(valids).any(0)
+        error_NBHW = torch.stack(errors)
+        error_BHW = soft_minimum(error_NBHW, softness) if softness else error_NBHW.amin(0)
+        return error_BHW, torch.stack(valids).any(0)
 
     total, scales = target_B3HW.new_zeros(()), target_B3HW.new_zeros((), dtype=torch.int64)
     for inverse_B1HW in inverse_SB1HW:
@@ -82,6 +86,18 @@ def photometric_loss(
         total = total + error_BHW.masked_fill(~counts_BHW, 0).sum() / number.clamp(min=1)
         scales += number > 0
     return total / int(scales) if scales > 0 else None
+
+
+def soft_minimum(error_NBHW: Tensor, softness: float) -> Tensor:
+    """-softness * log mean exp(-error / softness) of the finite ones: [B,H,W].
+
+    Errors that differ by much less than the softness are averaged, which halves their noise and
+    leaves a wrong motion to no frame; of those that differ by more, such as where something hides a
+    point from one frame, the smaller one counts.
+    """
+    number_BHW = error_NBHW.isfinite().sum(0, dtype=error_NBHW.dtype).clamp(min=1)
+    log_sum_BHW = (error_NBHW / -softness).logsumexp(0)
+    return -softness * (log_sum_BHW - number_BHW.log())
 
 
 REACH = 0.4  # of the logarithm of depth, of the farthest hint
