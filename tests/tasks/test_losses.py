@@ -344,11 +344,13 @@ def hint_gradient(scene: Scene, factor: float) -> Tensor:
 
 
 @pytest.mark.parametrize(("factor", "sign"), [(1.3, 1), (0.75, -1)])
-def test_hints_lead_to_the_true_depth_with_equal_strength_near_and_far(factor, sign) -> None:
-    grad = hint_gradient(Scene(batch=4), factor)
-    found = grad[grad != 0].abs()
-    torch.testing.assert_close(found, torch.full_like(found, float(found[0])))
+def test_hints_lead_to_the_true_depth_and_the_more_the_farther_it_is(factor, sign) -> None:
+    scene = Scene(batch=4)
+    grad = hint_gradient(scene, factor)
     assert (grad.sign() == sign).double().mean() > 0.8
+    relative = scene.depth / scene.depth[0].median()
+    strength = (grad / relative.clamp(0.25, 5)).abs()[grad != 0]
+    torch.testing.assert_close(strength, torch.full_like(strength, float(strength[0])))
 
 
 def test_hints_leave_the_true_depth_alone() -> None:
@@ -369,7 +371,8 @@ def test_hint_error_is_the_distance_to_the_better_of_two_depths() -> None:
     found = hint_error(depth, own, rebuilt)
     for b, step in enumerate((0.2, 0.4)):
         better = torch.minimum(farther[b], nearer[b]) < own[b]
-        torch.testing.assert_close(found[b], step * better.float())
+        weight = depth[b, 0] / depth[b, 0].mean()
+        torch.testing.assert_close(found[b], step * better * weight)
     assert 0 < (found > 0).double().mean() < 1
 
 

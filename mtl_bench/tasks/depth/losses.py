@@ -101,19 +101,20 @@ def soft_minimum(error_NBHW: Tensor, softness: float) -> Tensor:
 
 
 REACH = 0.4  # of the logarithm of depth, of the farthest hint
+RANGE = (0.25, 5.0)  # of a pixel's weight: the sky's depth can be anything
 
 
 def hint_error(
     depth_B1HW: Tensor, error_BHW: Tensor, rebuilt: Callable[[Tensor], tuple[Tensor, Tensor]]
 ) -> Tensor:
-    """How far the logarithm of depth is from that of a better depth, where one is found: [B,H,W].
+    """How far depth is from a better one, where one is found, over the image's depth: [B,H,W].
 
     The photometric error hardly tells far from very far: the flow of a far pixel is small, and so
     is its gradient. Which of two depths rebuilds a pixel better is as clear there as it is near. So
     the depth of each sample is tried once farther and once nearer by one factor, from small ones at
-    the batch's first sample to exp(REACH) at its last, and where one of them is better, it is a
-    label. After Watson et al., "Self-supervised monocular depth hints" (ICCV 2019), whose hints are
-    found by stereo matching.
+    the batch's first sample to exp(REACH) at its last. Where one of them is better it is a label:
+    the error is the difference of logarithms, weighed by depth. After Watson et al.,
+    "Self-supervised monocular depth hints" (ICCV 2019), whose hints are found by stereo matching.
 
     Args:
         error_BHW: of the depth.
@@ -128,7 +129,10 @@ def hint_error(
         nearer_BHW, _ = rebuilt(depth_B1HW / factor_B111)
         hint_BHW = log_BHW + torch.where(farther_BHW < nearer_BHW, step_B11, -step_B11)
         better_BHW = torch.minimum(farther_BHW, nearer_BHW) < error_BHW
-    return (log_BHW - hint_BHW).abs() * better_BHW
+        median_B11 = depth_B1HW.flatten(1).median(1).values[:, None, None]
+        weight_BHW = (depth_B1HW.squeeze(1) / median_B11).clamp(*RANGE)
+        weight_BHW *= better_BHW / weight_BHW.mean((1, 2), keepdim=True)
+    return (log_BHW - hint_BHW).abs() * weight_BHW
 
 
 def _erode(mask_BHW: Tensor) -> Tensor:
