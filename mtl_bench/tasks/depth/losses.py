@@ -91,9 +91,9 @@ def photometric_loss(
 def soft_minimum(error_NBHW: Tensor, softness: float) -> Tensor:
     """-softness * log mean exp(-error / softness) of the finite ones: [B,H,W].
 
-    Errors that differ by much less than the softness are averaged, which halves their noise and
-    leaves a wrong motion to no frame; of those that differ by more, such as where something hides a
-    point from one frame, the smaller one counts.
+    Errors that differ by much less than the softness are averaged: both frames then speak for a
+    depth, and both motions have to be right. Of those that differ by more, such as where something
+    hides a point from one frame, the smaller one counts.
     """
     number_BHW = error_NBHW.isfinite().sum(0, dtype=error_NBHW.dtype).clamp(min=1)
     log_sum_BHW = (error_NBHW / -softness).logsumexp(0)
