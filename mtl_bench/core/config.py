@@ -66,7 +66,6 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("data", "stride"),
     ("data", "min_flow"),
     ("network", "decoder"),
-    ("loss", "softness"),
     ("loss", "hints"),
     ("optim", "milestones"),
     ("optim", "milestone_factor"),

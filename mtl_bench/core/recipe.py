@@ -127,9 +127,6 @@ class Loss(Checked):
     ] = (0, 1, 2)
     automask: Annotated[bool, "unwarped frames among the minimum's candidates"] = True
     ssim_weight: Annotated[Share, "of SSIM in the photometric loss; the rest is L1's"] = 0.85
-    softness: Annotated[
-        NotNegative, "of the minimum over warped frames, in units of their error; 0: the smallest"
-    ] = 0.0
     hints: Annotated[
         NotNegative, "in the photometric loss, of better depths that are tried; 0: none are"
     ] = 0.0

@@ -17,7 +17,6 @@ from mtl_bench.tasks.depth.losses import (
     hint_error,
     photometric_loss,
     smoothness_loss,
-    soft_minimum,
 )
 from mtl_bench.tasks.panoptic.losses import center_loss, offset_loss, semantic_loss
 
@@ -130,7 +129,6 @@ class Scene:
         self,
         inverse: Tensor | None = None,
         automask: bool = False,
-        softness: float = 0.0,
         hints: float = 0.0,
         **changed: Tensor,
     ) -> Tensor:
@@ -141,7 +139,6 @@ class Scene:
             K_B33=self.K,
             **{"mask_BHW": self.mask} | frames,
             automask=automask,
-            softness=softness,
             hints=hints,
         )
 
@@ -296,39 +293,6 @@ def test_a_tie_goes_to_the_unwarped_frame() -> None:
         assert bool((grad == 0).all()) == automask
 
 
-# --- soft minimum -------------------------------------------------------------------------------
-
-
-def test_soft_minimum_lies_between_the_smallest_and_the_mean() -> None:
-    torch.manual_seed(6)
-    error = torch.rand(3, 2, 4, 5, dtype=F64)
-    found = soft_minimum(error, 0.1)
-    expected = -0.1 * torch.log(torch.exp(-error / 0.1).mean(0))
-    torch.testing.assert_close(found, expected)
-    assert (error.amin(0) < found).all()
-    assert (found < error.mean(0)).all()
-    torch.testing.assert_close(soft_minimum(error, 1e-4), error.amin(0), rtol=0, atol=2e-4)
-    torch.testing.assert_close(soft_minimum(error, 1e4), error.mean(0), rtol=0, atol=1e-4)
-
-
-def test_soft_minimum_leaves_out_what_is_out_of_view() -> None:
-    error = torch.tensor([[[[0.3, torch.inf, torch.inf]]], [[[0.1, 0.2, torch.inf]]]])
-    found = soft_minimum(error, 0.1)[0, 0]
-    assert found[1].item() == pytest.approx(0.2)
-    assert found[2] == torch.inf
-
-
-def test_soft_minimum_of_the_loss_has_finite_gradients_where_nothing_is_in_view() -> None:
-    scene = Scene()
-    inverse = (scene.inverse * 1.1).requires_grad_()
-    aside = scene.transforms.clone()
-    aside[..., 0, 3] = 2.0  # most of the frame is in no neighbour's view
-    scene.loss(inverse, softness=0.1, hints=0.1, transforms_BN44=aside).backward()
-    assert inverse.grad is not None
-    assert inverse.grad.isfinite().all()
-    assert 0 < (inverse.grad != 0).double().mean() < 0.9
-
-
 # --- hints ----------------------------------------------------------------------------------------
 
 
@@ -355,6 +319,17 @@ def test_hints_lead_to_the_true_depth_and_the_more_the_farther_it_is(factor, sig
 
 def test_hints_leave_the_true_depth_alone() -> None:
     assert hint_gradient(Scene(batch=4), 1.0).sign().abs().mean() < 0.02
+
+
+def test_hints_have_finite_gradients_where_nothing_is_in_view() -> None:
+    scene = Scene()
+    inverse = (scene.inverse * 1.1).requires_grad_()
+    aside = scene.transforms.clone()
+    aside[..., 0, 3] = 2.0  # most of the frame is in no neighbour's view
+    scene.loss(inverse, hints=0.1, transforms_BN44=aside).backward()
+    assert inverse.grad is not None
+    assert inverse.grad.isfinite().all()
+    assert 0 < (inverse.grad != 0).double().mean() < 0.9
 
 
 def test_hint_error_is_the_distance_to_the_better_of_two_depths() -> None:

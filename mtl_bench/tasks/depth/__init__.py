@@ -180,7 +180,6 @@ class Depth(Task):
             full(maps["transforms"]),
             ssim_weight=loss.ssim_weight,
             automask=loss.automask,
-            softness=loss.softness,
             hints=loss.hints,
         )
         if photometric is None:  # smoothness alone, which only regularises it, wants a flat world

@@ -25,7 +25,6 @@ def photometric_loss(
     *,
     ssim_weight: float = 0.85,
     automask: bool = True,
-    softness: float = 0.0,
     hints: float = 0.0,
 ) -> Tensor | None:
     """Smallest error per pixel among the warped context frames, averaged over pixels and scales.
@@ -48,7 +47,6 @@ def photometric_loss(
         inverse_SB1HW: one inverse depth a scale, all at full resolution.
         transforms_BN44: take points from the target's camera to each context frame's.
         mask_BHW: bool, False on sky, ego vehicle and padding.
-        softness: of the minimum over warped frames, see `soft_minimum`; 0: the smallest counts.
         hints: weight of `hint_error`.
     """
     inside_BHW = _erode(mask_BHW)
@@ -69,9 +67,7 @@ def photometric_loss(
             )
             valids.append(valid_B1HW.squeeze(1))
             errors.append(error_of(warped_B3HW).masked_fill(~valids[-1], torch.inf))
-        error_NBHW = torch.stack(errors)
-        error_BHW = soft_minimum(error_NBHW, softness) if softness else error_NBHW.amin(0)
-        return error_BHW, torch.stack(valids).any(0)
+        return torch.stack(errors).amin(0), torch.stack(valids).any(0)
 
     total, scales = target_B3HW.new_zeros(()), target_B3HW.new_zeros((), dtype=torch.int64)
     for inverse_B1HW in inverse_SB1HW:
@@ -86,18 +82,6 @@ def photometric_loss(
         total = total + error_BHW.masked_fill(~counts_BHW, 0).sum() / number.clamp(min=1)
         scales += number > 0
     return total / int(scales) if scales > 0 else None
-
-
-def soft_minimum(error_NBHW: Tensor, softness: float) -> Tensor:
-    """-softness * log mean exp(-error / softness) of the finite ones: [B,H,W].
-
-    Errors that differ by much less than the softness are averaged: both frames then speak for a
-    depth, and both motions have to be right. Of those that differ by more, such as where something
-    hides a point from one frame, the smaller one counts.
-    """
-    number_BHW = error_NBHW.isfinite().sum(0, dtype=error_NBHW.dtype).clamp(min=1)
-    log_sum_BHW = (error_NBHW / -softness).logsumexp(0)
-    return -softness * (log_sum_BHW - number_BHW.log())
 
 
 REACH = 0.4  # of the logarithm of depth, of the farthest hint
