@@ -39,7 +39,7 @@ from mtl_bench.data.scenes.surfaces import (
     lattice_noise,
 )
 
-RENDERER_VERSION = 6  # raised with every change of what is drawn
+RENDERER_VERSION = 7  # raised with every change of what is drawn
 EGO, SKY = 1, 23
 _DIVISOR = 1000
 
@@ -71,13 +71,13 @@ class Scene:
     bonnet_color_3: FloatArray
 
     def viewer(self, frame: int) -> Pose:
-        """The camera for which a frame's texture is filtered: one for every seven frames.
+        """The camera for which a frame's texture is filtered: one for every nine frames.
 
         Texture that is filtered anew for every frame sharpens as it comes nearer, and then the same
-        point has two colours. The annotated frame shares a filter with three frames on either side.
+        point has two colours. The annotated frame shares a filter with four frames on either side.
         Between two groups of a longer snippet true depth and motion explain nearly nothing.
         """
-        shared = frame + 3 - (frame - self.annotated + 3) % 7
+        shared = frame + 4 - (frame - self.annotated + 4) % 9
         return self.motion.poses[min(max(shared, 0), len(self.motion.poses) - 1)]
 
     def cast(
