@@ -66,6 +66,7 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("data", "stride"),
     ("data", "min_flow"),
     ("network", "decoder"),
+    ("network", "depth_slope"),
     ("loss", "hints"),
     ("optim", "milestones"),
     ("optim", "milestone_factor"),

@@ -47,6 +47,16 @@ def finish() -> Finish:
     return Finish().eval()
 
 
+@pytest.mark.parametrize("slope", [0.0, 4.0])
+def test_depth_starts_as_a_ground_that_comes_nearer_by_the_slope(slope):
+    network = config.Network(depth_slope=slope)
+    (depth,) = tasks_of(config.Recipe(network=network), ["depth"], CITYSCAPES20)
+    inverse = depth.activate({"inverse": torch.zeros(1, 1, 4, 3)})["inverse"]
+    logits = (inverse * network.min_depth).logit()
+    rows = torch.tensor([-0.375, -0.125, 0.125, 0.375])  # the middles of four of them
+    torch.testing.assert_close(logits, slope * rows[:, None].expand(1, 1, 4, 3))
+
+
 def inputs(seed: int, case: str = "plain") -> tuple[torch.Tensor, ...]:
     """Blobs of all classes over a noisy road; heat and offsets of any kind."""
     generator = torch.Generator().manual_seed(seed)

@@ -62,6 +62,13 @@ def _map(scale: int) -> str:
     return f"inverse.{scale}" if scale else "inverse"
 
 
+def _rows(map_: Tensor) -> Tensor:
+    """[h,1]: the middles of a map's rows, -1/2 at the image's upper edge, 1/2 at its lower one."""
+    height = map_.shape[-2]
+    rows = torch.arange(height, device=map_.device) + 0.5
+    return (rows / height - 0.5).to(map_.dtype)[:, None]
+
+
 class Depth(Task):
     terms = (
         Term("photometric", "depth", "regression", 1.0),
@@ -138,8 +145,14 @@ class Depth(Task):
         return DepthHead(inputs, sizes)
 
     def activate(self, maps: Maps) -> Maps:
-        """Inverse depth, of an arbitrary unit, at most 1 / min_depth."""
-        least = self.recipe.network.min_depth
+        """Inverse depth, of an arbitrary unit, at most 1 / min_depth.
+
+        With a slope, training starts from a ground that comes nearer towards the image's bottom.
+        From a wall, which both explain equally badly, some networks learn it upside down.
+        """
+        least, slope = self.recipe.network.min_depth, self.recipe.network.depth_slope
+        if slope:
+            maps = {name: map_ + slope * _rows(map_) for name, map_ in maps.items()}
         return {name: map_.sigmoid() / least for name, map_ in maps.items()}
 
     def extra(self, sizes: Network, pretrained: bool) -> dict[str, nn.Module]:
