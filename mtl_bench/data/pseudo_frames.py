@@ -43,8 +43,8 @@ class CityscapesFrames:
         if not self.names:
             raise ValueError(
                 f"{self.source}: no frame without a human label that has both neighbours; unpack "
-                f"{SEQUENCE.package}, or render the built-in scenes with recipe.data.frames=4 or "
-                f"more"
+                f"{SEQUENCE.package}, or render the built-in scenes with recipe.data.frames="
+                f"{2 * recipe.data.stride + 2} or more"
             )
         if self.folder.resolve().is_relative_to((root / LABELS.folder).resolve()):
             raise ValueError(f"{out}: the data set's own labels belong there; choose another --out")
