@@ -110,7 +110,8 @@ class Network(Checked):
         Positive, "depth = 1 / (sigmoid / min_depth), in the network's arbitrary unit"
     ] = 0.5
     depth_slope: Annotated[
-        NotNegative, "added to inverse depth's logits, from -1/2 at the top to 1/2 at the bottom"
+        NotNegative,
+        "the start's, from the image's top to its bottom, in logits of inverse depth; 0: a wall",
     ] = 0.0
     batch_norm_momentum: Annotated[float, above(0), most(1), "of all behind the backbone"] = 0.01
 

@@ -147,8 +147,8 @@ class Depth(Task):
     def activate(self, maps: Maps) -> Maps:
         """Inverse depth, of an arbitrary unit, at most 1 / min_depth.
 
-        With a slope, training starts from a ground that comes nearer towards the image's bottom.
-        From a wall, which both explain equally badly, some networks learn it upside down.
+        With a slope, training starts from a ground that comes nearer towards the image's bottom. A
+        wall is as far from the world as from the world upside down, and some networks learn that.
         """
         least, slope = self.recipe.network.min_depth, self.recipe.network.depth_slope
         if slope:

@@ -107,8 +107,8 @@ def hint_error(
     log_BHW = depth_B1HW.log().squeeze(1)
     with torch.no_grad():
         count = len(depth_B1HW)
-        like = {"device": depth_B1HW.device, "dtype": depth_B1HW.dtype}
-        step_B11 = torch.linspace(REACH / count, REACH, count, **like)[:, None, None]
+        places_B = torch.arange(1, count + 1, device=depth_B1HW.device, dtype=depth_B1HW.dtype)
+        step_B11 = (REACH / count * places_B)[:, None, None]
         factor_B111 = step_B11.exp().unsqueeze(1)
         farther_BHW, _ = rebuilt(depth_B1HW * factor_B111)
         nearer_BHW, _ = rebuilt(depth_B1HW / factor_B111)
