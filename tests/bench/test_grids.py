@@ -330,13 +330,13 @@ def test_unknown_grid():
 
 
 IDS = [  # digests of all ids of a shipped grid, and of its smoke run: what was run is found by them
-    ("ablation", "7983cb91ed16", "8093db8f83e2"),
-    ("ablation-controls", "5b7384aadf13", "91dd77aa3da9"),
-    ("backbones", "598dabcd4096", "1d2d158a9724"),
+    ("ablation", "01eaaa62614d", "25ce0926b98a"),
+    ("ablation-controls", "9147022e3ed8", "8ef8a73b2110"),
+    ("backbones", "c5739700429e", "aed5ec2cac11"),
     ("kitti", "43149427a83e", "502da380f4d0"),
-    ("latency", "a77fe8bc6487", "a266f7898b34"),
-    ("seeds", "5752590e4b2d", "89cafecefdb1"),
-    ("weighting", "3f296a0c58a1", "90b57b1a1c87"),
+    ("latency", "a77fe8bc6487", "3ec8f9a10500"),
+    ("seeds", "c8f9b6e1642e", "9b0f88f5d5f1"),
+    ("weighting", "261b04e24452", "2a5e2efd9ba8"),
 ]
 
 
