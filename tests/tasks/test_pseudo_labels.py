@@ -430,7 +430,9 @@ def test_what_cannot_be_labelled(scenes, knowing, tmp_path):
     for name in BETWEEN:
         path = file_of(labelled / "gtFine" / "train", LABELS, name)
         put_png(path, np.full((HEIGHT, WIDTH), 7, np.uint16))
-    refused("no frame without a human label", Oracle(never), CELL, labelled, out)
+    far = replace(CELL.recipe, data=replace(CELL.recipe.data, stride=3))
+    refused("recipe.data.frames=4 or more", Oracle(never), CELL, labelled, out)
+    refused("recipe.data.frames=8 or more", Oracle(never), replace(CELL, recipe=far), labelled, out)
     assert not out.exists()
     broken = knowing()
     broken.net = Net(lambda image: [map_ * torch.nan for map_ in broken.answer(image)])
