@@ -26,6 +26,7 @@ from mtl_bench.train.compose import compose
 from mtl_bench.train.curve import Curve, Unwritten
 from mtl_bench.train.progress import Interrupted, Pace, Progress
 from mtl_bench.train.replay import Replay, replay_of
+from mtl_bench.train.statistics import silence_constants
 from mtl_bench.train.together import Together
 from mtl_bench.train.tracking import Tracker
 
@@ -191,6 +192,8 @@ def train(
             if slow := pace.note(step_ms, data_ms):
                 progress.say(slow)
             stop = ranks.any(progress.stop_asked)
+            if step == optim.steps and (silenced := silence_constants(model)):
+                progress.say(f"{silenced} channels were constant in training, and stay so")
             if step % optim.checkpoint_every == 0 or step == optim.steps or stop:
                 save()
             if stop:

@@ -1,4 +1,5 @@
-"""Running statistics of batch norms: left alone by passes that do not count, one on all ranks.
+"""Running statistics of batch norms: left alone by passes that do not count, one on all ranks, and
+not trusted where training saw a constant.
 
 A batch norm's statistics follow the parts of a batch one after another: r <- (1 - m) r + m s. What
 n parts each on W ranks make of them is therefore, of the ranks' own r_i that all began with r_0,
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from mtl_bench.core.ranks import Ranks
 
 Norm = nn.modules.batchnorm._BatchNorm
+CONSTANT = 1e-6  # variance, of eps: what comes out of the norm varies by less than a thousandth
 
 
 class Modules(Protocol):
@@ -61,6 +63,25 @@ def common_statistics(model: Modules, ranks: Ranks) -> Iterator[None]:
     merged = ranks.sum_(torch.cat(terms)).split([len(term) for term in terms])
     for (was, now), value in zip(moved, merged, strict=True):
         now.set(value, was.parts + (now.parts - was.parts) * ranks.size)
+
+
+def silence_constants(model: Modules) -> int:
+    """Give scale 0 to what the batch norms that train have seen as constant for long.
+
+    A depthwise convolution behind a silent ReLU has one value, and its running variance shrinks to
+    nothing. An image that wakes the ReLU comes out of the norm 1 / sqrt(eps) = 300 times as large,
+    and drowns all other channels. On what training has seen, scale 0 changes nothing.
+
+    Returns:
+        How many channels it was.
+    """
+    silenced = 0
+    for norm in _norms(model):
+        if norm.training and norm.affine and norm.running_var is not None:
+            constant_C = norm.running_var < CONSTANT * norm.eps
+            norm.weight.data.masked_fill_(constant_C, 0)
+            silenced += int(constant_C.sum())
+    return silenced
 
 
 class _Seen:
