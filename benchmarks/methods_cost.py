@@ -2,7 +2,7 @@
 
     python benchmarks/methods_cost.py [--granularity terms] [--tasks 40] [NAME ...] > cost.md
 
-The network is the real one: ResNet18, the recipe `small` (64 x 128, batch 8); with `--tasks K`
+The network is the real one: ResNet18, the recipe `small` (64 x 128, batch 4); with `--tasks K`
 CelebA's cnn9 and K of its attributes (64 x 64, batch 16). A step is forward,
 backward and method, for every method with its defaults; the optimiser's step is the same for all
 and is left out. Every ratio is of two steps that ran one after the other, in alternating order, so
