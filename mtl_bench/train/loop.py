@@ -193,7 +193,7 @@ def train(
                 progress.say(slow)
             stop = ranks.any(progress.stop_asked)
             if step == optim.steps and (silenced := silence_constants(model)):
-                progress.say(f"{silenced} channels were constant in training, and stay so")
+                progress.say(f"channels that were constant in training, and stay so: {silenced}")
             if step % optim.checkpoint_every == 0 or step == optim.steps or stop:
                 save()
             if stop:

@@ -7,6 +7,7 @@ from support.training import run
 from torch import nn
 
 from mtl_bench.train import checkpoint
+from mtl_bench.train.progress import Progress
 from mtl_bench.train.statistics import silence_constants
 
 
@@ -59,7 +60,10 @@ def test_the_last_checkpoint_has_it(smoke_cell, smoke_root, with_optim, tmp_path
             convolution.weight[0] = 0
         convolution.weight.requires_grad_(False)
 
-    run(with_optim(cell, steps=2), smoke_root, tmp_path / "run", rehearse=kill)
+    said = []
+    progress = Progress(tmp_path, said.append)
+    run(with_optim(cell, steps=2), smoke_root, tmp_path / "run", progress, rehearse=kill)
+    assert said[-1].endswith("stay so: 1")
     weights = checkpoint.read(tmp_path / "run" / "last.pt")["model"][f"net.{name}.1.weight"]
     assert weights[0] == 0
     assert (weights[1:] != 0).all()
