@@ -77,6 +77,7 @@ LATER: tuple[tuple[str, str], ...] = (  # section, key
     ("evaluate", "also"),
     ("evaluate", "flip"),
     ("optim", "one_batch"),
+    ("optim", "statistics_batches"),
 )
 
 NOT_SET = {

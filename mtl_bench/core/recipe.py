@@ -166,6 +166,9 @@ class Optim(Checked):
     milestone_factor: Annotated[Share, "see milestones"] = 0.5
     clip: Annotated[Positive | None, "total gradient norm"] = 0.01
     precision: Annotated[str, one_of("fp32", "bf16", "fp16"), "of training"] = "fp32"
+    statistics_batches: Annotated[
+        Whole, "after the last step, whose means batch norms keep; 0: running ones"
+    ] = 0
     checkpoint_every: Annotated[Count, "steps; no part of a cell's id"] = 1000
     cosine_every: Annotated[
         Whole, "steps between logged cosines of the task gradients; 0: never; no part of the id"

@@ -140,6 +140,18 @@ def train(
             for index, part in enumerate(split, before)
         ]
 
+    def settle() -> None:
+        """Batch norms' statistics become those of the network as it is after the last step."""
+        further = optim.statistics_batches
+        if further:
+            with torch.no_grad(), together.mean_statistics(model):
+                for number in range(further):
+                    for part in parts_of(next(batches), step * method.batches + number):
+                        part()
+                    progress.update("statistics", number + 1, further)
+        if silenced := silence_constants(model):
+            progress.say(f"channels that were constant in training, and stay so: {silenced}")
+
     def check(losses: Mapping[str, Tensor]) -> None:
         check_finite(losses, step)
 
@@ -192,8 +204,8 @@ def train(
             if slow := pace.note(step_ms, data_ms):
                 progress.say(slow)
             stop = ranks.any(progress.stop_asked)
-            if step == optim.steps and (silenced := silence_constants(model)):
-                progress.say(f"channels that were constant in training, and stay so: {silenced}")
+            if step == optim.steps:
+                settle()
             if step % optim.checkpoint_every == 0 or step == optim.steps or stop:
                 save()
             if stop:

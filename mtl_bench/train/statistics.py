@@ -1,5 +1,5 @@
-"""Running statistics of batch norms: left alone by passes that do not count, one on all ranks, and
-not trusted where training saw a constant.
+"""Running statistics of batch norms: left alone by passes that do not count, one on all ranks,
+means of many batches at the end, and not trusted where training saw a constant.
 
 A batch norm's statistics follow the parts of a batch one after another: r <- (1 - m) r + m s. What
 n parts each on W ranks make of them is therefore, of the ranks' own r_i that all began with r_0,
@@ -63,6 +63,29 @@ def common_statistics(model: Modules, ranks: Ranks) -> Iterator[None]:
     merged = ranks.sum_(torch.cat(terms)).split([len(term) for term in terms])
     for (was, now), value in zip(moved, merged, strict=True):
         now.set(value, was.parts + (now.parts - was.parts) * ranks.size)
+
+
+@contextlib.contextmanager
+def mean_statistics(model: Modules, ranks: Ranks) -> Iterator[None]:
+    """After it, the batch norms that train have the means of all parts' statistics inside, of all
+    ranks, in place of running ones, which are mostly of the last 1 / momentum parts.
+
+    Source: "precise BN" of Wu, Johnson, Rethinking "Batch" in BatchNorm, arXiv:2105.07576, 3.
+    """
+    norms = [norm for norm in _norms(model) if norm.training and norm.running_mean is not None]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None  # torch's word for a mean
+    yield
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
+    if ranks.size == 1 or not norms:
+        return
+    seen = [_Seen(norm) for norm in norms]
+    means = ranks.sum_(torch.cat([one.value for one in seen])) / ranks.size
+    for one, mean in zip(seen, means.split([len(one.value) for one in seen]), strict=True):
+        one.set(mean, one.parts * ranks.size)
 
 
 def silence_constants(model: Modules) -> int:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from mtl_bench.core.ranks import ALONE, Ranks
-from mtl_bench.train.statistics import Modules, common_statistics
+from mtl_bench.train.statistics import Modules, common_statistics, mean_statistics
 
 Gradient = Sequence[Tensor | None]  # of some tensors, None where it is zero
 
@@ -114,3 +114,7 @@ class Together:
         if self.one_batch:
             return nullcontext()
         return common_statistics(model, self.ranks)
+
+    def mean_statistics(self, model: Modules) -> AbstractContextManager[None]:
+        """See `mean_statistics`; those of one batch are common already."""
+        return mean_statistics(model, ALONE if self.one_batch else self.ranks)

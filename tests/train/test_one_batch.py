@@ -154,6 +154,11 @@ def test_two_ranks_are_one_batch_of_a_trunk(method, pair, tmp_path):
     assert compare(pair, trunk_cell(method, *ONE_BATCH), scales_root(), tmp_path) < NEAR
 
 
+def test_means_of_statistics_are_of_whole_batches(pair, smoke_root, tmp_path):
+    cell = network_cell("fixed", *ONE_BATCH, "recipe.optim.statistics_batches=3")
+    assert compare(pair, cell, smoke_root, tmp_path) < NEAR
+
+
 def test_replayed_weights_train_one_batch_too(pair, tmp_path):
     root, origin = scales_root(), trunk_cell("upgrad", *ONE_BATCH)
     exactly(ALONE, origin, root, tmp_path / "record")

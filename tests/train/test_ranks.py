@@ -287,6 +287,11 @@ def test_a_batch_norm_without_momentum_is_refused():
         side_by_side(2, seen)
 
 
+def test_means_of_statistics_are_of_all_ranks_parts(pair, smoke_root, tmp_path):
+    cell = network_cell("fixed", "recipe.optim.statistics_batches=3")
+    compare(pair, cell, smoke_root, tmp_path, atol=1e-5)
+
+
 # --- losses and gradients that one rank lacks -----------------------------------------------------
 
 
