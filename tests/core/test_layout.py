@@ -168,9 +168,9 @@ def processor_s(*words):
 
 
 def test_help_takes_little_more_than_the_library_that_parses_it():
-    """0.3 s where that takes 0.11 s; as a ratio, since machines differ and slow down."""
+    """2.6 times as much on an idle machine; with the library of pictures it was twice that."""
     library = processor_s("-c", "import typer")
-    assert processor_s("-m", "mtl_bench", "--help") < 0.3 / 0.11 * library
+    assert processor_s("-m", "mtl_bench", "--help") < 3.5 * library
 
 
 def test_help_waits_for_no_library_of_pictures():
