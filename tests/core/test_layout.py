@@ -168,7 +168,7 @@ def processor_s(*words):
 
 
 def test_help_takes_little_more_than_the_library_that_parses_it():
-    """2.6 times as much on an idle machine; with the library of pictures it was twice that."""
+    """2.6 times as much on an idle machine; drawn by rich it was twice that."""
     library = processor_s("-c", "import typer")
     assert processor_s("-m", "mtl_bench", "--help") < 3.5 * library
 
