@@ -83,7 +83,12 @@ def latency(
         int, typer.Option(min=1, help="Images at once for the throughput; 1: as the latency.")
     ] = 4,
     threads: Annotated[
-        int | None, typer.Option(min=1, help="On the CPU; without it all.", show_default=False)
+        int | None,
+        typer.Option(
+            min=1,
+            help="On the CPU; without it all. Small images may be quicker on one.",
+            show_default=False,
+        ),
     ] = None,
     file: Annotated[
         Path | None,

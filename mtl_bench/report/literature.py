@@ -404,13 +404,13 @@ def _texts(literature: Literature, rows: Sequence[Row]) -> dict[str, str]:
         cell.get("recipe.data.width"),
     ]
     timed = [metric[k] for k in ("latency.height", "latency.width") if k in metric]
+    metrics = [row.get("metric", {}) for row in rows]
     devices = dict.fromkeys(
-        UNNEEDED.sub("", str(row["metric"]["latency.device"]))
-        for row in rows
-        if "latency.device" in row.get("metric", {})
+        UNNEEDED.sub("", str(m["latency.device"])) for m in metrics if "latency.device" in m
     )
     elsewhere = [f"at {_size(timed, literature)}"] * (bool(timed) and timed != list(size))
-    threads = [f"{metric[k]} threads" for k in ("latency.threads",) if k in metric]
+    counts = sorted({m["latency.threads"] for m in metrics if "latency.threads" in m})
+    threads = [f"{' or '.join(map(str, counts))} thread{'s' * (counts != [1])}"] if counts else []
     return {
         "method": str(cell.get("method")),
         "backbone": str(cell.get("backbone")),

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import nn
 
+from mtl_bench.bench import stored
 from mtl_bench.bench.stored import time_cell
 from mtl_bench.core.batch import collate
 from mtl_bench.core.config import Cell, Latency, load_recipe
@@ -105,3 +106,26 @@ def test_the_depth_scale_is_timed_as_it_is_evaluated(cell_and_root, tmp_path):
             assert torch.equal(getattr(camera, name), value), name
         for name, value in evaluated.items():
             assert torch.equal(found[name], value), name
+
+
+def test_a_cell_is_timed_on_the_threads_that_are_quickest(cell_and_root, tmp_path, monkeypatch):
+    cell, root = cell_and_root
+    took_ms, timed = {1: 3.0, 2: 2.0, 4: 5.0, 6: 9.0}, []
+
+    def measured(model, images, camera, latency, device, precision):
+        threads = torch.get_num_threads()
+        timed.append((threads, latency.passes))
+        return {"latency.p50_ms": took_ms[threads], "latency.threads": threads}
+
+    before = torch.get_num_threads()
+    monkeypatch.setattr(stored, "measure", measured)
+    monkeypatch.setattr(stored.provenance, "cores", lambda: 6)
+    (tmp_path / "runs").mkdir()
+    timing, _ = time_cell(Fixed(cell), cell, root, Compute(CPU), Quiet(tmp_path / "runs"))
+    assert timed == [(1, 10), (2, 10), (4, 10), (6, 10), (2, cell.recipe.latency.passes)]
+    assert timing == {"latency.p50_ms": 2.0, "latency.threads": 2}
+    assert torch.get_num_threads() == before
+
+
+def test_one_core_is_not_tried():
+    assert stored.quickest(1, lambda count: pytest.fail("timed")) == 1

@@ -106,6 +106,17 @@ def test_a_row_of_the_data_set_stands_among_the_published_in_its_order():
     assert halves(own, "runtime_ms") == ("12.3", "")
 
 
+@pytest.mark.parametrize(("counts", "said"), [((1, 1), "1 thread"), ((2, 1), "1 or 2 threads")])
+def test_the_threads_of_all_seeds_are_said(counts, said):
+    rows = [
+        row(seed=seed, metric={"panoptic.pq": 60.5, "latency.threads": count})
+        for seed, count in enumerate(counts)
+    ]
+    (section,) = compare("cityscapes", rows).sections
+    (own,) = [line for line in section.lines if line.kind == "measured"]
+    assert own.texts["device"] == f"A CPU, {said}"
+
+
 @pytest.mark.parametrize(
     ("name", "made", "expected"),
     [
