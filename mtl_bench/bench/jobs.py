@@ -42,6 +42,7 @@ from mtl_bench.deploy import engines
 
 PROTOCOL = 1  # raised when times taken before stop being comparable with times taken after
 NOTHING: Mapping[str, Any] = MappingProxyType({})
+AFTERWARDS = ("eval_s", "latency_s")  # a row's times of what comes after training
 # Of `config.LATER`, what timings have had from their first day
 KEPT = (("evaluate", "protocol"), ("evaluate", "also"), ("evaluate", "flip"))
 SIZE = re.compile(r"([1-9]\d*)x([1-9]\d*)")
@@ -224,8 +225,8 @@ class Kind(ABC, Generic[J]):
         """What its duration grows with."""
 
     @abstractmethod
-    def seconds(self, row: Mapping[str, Any]) -> float:
-        """What a row says of its duration; 0: nothing."""
+    def seconds(self, row: Mapping[str, Any], trained: bool = False) -> float:
+        """What a row says of its duration, or of what comes after training; 0: nothing."""
 
     @abstractmethod
     def check(self, jobs: Iterable[J]) -> None:
@@ -286,8 +287,10 @@ class Cells(Kind[Cell]):
         """A single-task cell trains nothing: its row repeats the times of its parents."""
         return 0 if job.single_task else 1
 
-    def seconds(self, row: Mapping[str, Any]) -> float:
-        return float(sum(v for k, v in row.get("time", {}).items() if k.endswith("_s")))
+    def seconds(self, row: Mapping[str, Any], trained: bool = False) -> float:
+        took = row.get("time", {})
+        counted = AFTERWARDS if trained else [key for key in took if key.endswith("_s")]
+        return float(sum(took.get(key, 0.0) for key in counted))
 
     def check(self, jobs: Iterable[Cell]) -> None:
         check_cells(jobs)
@@ -334,7 +337,7 @@ class Timings(Kind[Timing]):
         """Passes and pixels; a limit of seconds is not looked at."""
         return job.passes * job.height * job.width
 
-    def seconds(self, row: Mapping[str, Any]) -> float:
+    def seconds(self, row: Mapping[str, Any], trained: bool = False) -> float:
         return float(row["seconds"]) if row["status"] == "done" else 0.0
 
     def check(self, jobs: Iterable[Timing]) -> None:

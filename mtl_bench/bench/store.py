@@ -41,6 +41,7 @@ TRAINED = ("last.pt", "curve.csv", "pseudo_labels", "row.json")
 ASIDE = "set-aside-"
 ELSEWHERE = "on another machine"
 SHOWN_S = 60.0  # for a file that another machine has written to be seen on a shared folder
+RENEWING = ("stale", "latency")  # ways to run again that keep a training of today's code
 KEPT = ("cell.json", "log.txt", "claim")  # what a fresh start leaves in place
 
 
@@ -262,15 +263,34 @@ def summary(kind: Kind[Any], jobs: Iterable[Job], runs: Path, data: Data | None 
 
 
 @plugins.listed_once()
-def hours_to_run(todo: Sequence[Job], jobs: Iterable[Job], runs: Path) -> float | None:
-    """Expected duration one after another, from those that are done; None where none is."""
+def hours_to_run(
+    todo: Sequence[Job],
+    jobs: Iterable[Job],
+    runs: Path,
+    rerun: str | None = None,
+    data: Data | None = None,
+) -> float | None:
+    """Expected duration one after another, from those that are done; None where none is.
+
+    Args:
+        rerun: as in `to_run`. What keeps its training takes what its row says of the rest.
+    """
     work = seconds = 0.0
     for job in jobs:
         kind, row = kind_of(job), inspect(job, runs).row
         if row is not None and kind.work(job) and kind.seconds(row):
             work += kind.work(job)
             seconds += kind.seconds(row)
-    return seconds / work * sum(kind_of(job).work(job) for job in todo) / 3600 if work else None
+    rest, left = 0.0, 0
+    for job in todo:
+        kind, state = kind_of(job), inspect(job, runs, data)
+        if rerun in RENEWING and state.trained and state.row is not None:
+            rest += kind.seconds(state.row, trained=True)
+        else:
+            left += kind.work(job)
+    if left and not work:
+        return None
+    return (rest + (left and seconds / work * left)) / 3600
 
 
 # --- beginning and failing ------------------------------------------------------------------------

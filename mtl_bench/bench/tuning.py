@@ -184,13 +184,16 @@ class Part:
         """The cells of its trials; of those that failed only where they are wanted again."""
         return [t.trial.cell for t in self.trials if again or t.score != -math.inf]
 
-    def hours(self, todo: Sequence[Job], runs: Path) -> float | None:
+    def hours(
+        self, todo: Sequence[Job], runs: Path, rerun: str | None = None, data: Data | None = None
+    ) -> float | None:
         """Expected, one cell after another; None where none is done.
 
         Args:
             todo: those of `cells` and of what they need that are not done.
+            rerun, data: as in `store.to_run`.
         """
-        return store.hours_to_run([*todo, *self.open], with_parents(self.cells), runs)
+        return store.hours_to_run([*todo, *self.open], with_parents(self.cells), runs, rerun, data)
 
 
 @plugins.listed_once()

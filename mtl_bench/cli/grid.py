@@ -397,7 +397,7 @@ def _tell_parts(
         finals = store.summary(grid.kind, [each.cell for each in part.finals], runs, data)
         waiting = f"{len(part.open)} after their trials" if part.open else ""
         words += ["results: " + "   ".join(filter(None, (finals, waiting)))]
-        hours = part.hours(todo, runs) if todo or part.open else 0.0
+        hours = part.hours(todo, runs, rerun, data) if todo or part.open else 0.0
         words += [
             "hours left: not known, none is done"
             if hours is None
@@ -411,6 +411,7 @@ def _announce(
 ) -> None:
     from mtl_bench.bench import references, store, tuning
     from mtl_bench.bench.jobs import CELLS, with_parents
+    from mtl_bench.bench.launch import duration
     from mtl_bench.bench.space import SPLIT
 
     counts = {axis: len(values) for axis, values in grid.axes.items()}
@@ -438,10 +439,10 @@ def _announce(
             f"{len(grid.jobs)} {grid.kind.noun}s{more} = {product}, less {len(grid.skips)} "
             f"skipped; {about}"
         )
-        hours = store.hours_to_run(todo, every, runs)
-        about = "" if hours is None or not todo else f"   about {hours:.1f} hours one after another"
-        done = store.summary(grid.kind, every, runs, data)
-        typer.echo(f"  {done}   to run {len(todo)}{about}")
+        hours = store.hours_to_run(todo, every, runs, rerun, data)
+        known = "" if hours is None else duration(hours * 3600)
+        about = f"   about {known} one after another" if known and todo else ""
+        typer.echo(f"  {store.summary(grid.kind, every, runs, data)}   to run {len(todo)}{about}")
     for line in _skipped(grid):
         typer.echo(line)
 

@@ -67,6 +67,27 @@ def test_a_damaged_row_is_named_and_costs_one_cell(junk, tmp_path):
     assert store.hours_to_run([one], [one, other], tmp_path) == pytest.approx(3 / 3600)
 
 
+def test_what_keeps_its_training_is_expected_to_take_what_its_row_says_of_the_rest(tmp_path):
+    one, other, third = cells(3)
+    now = provenance.code(one)
+    took = {"train_s": 100.0, "pseudo_s": 10.0, "eval_s": 3.0, "latency_s": 2.0, "step_ms": 9.0}
+    timed_before = {**now, "time": {"harness": "earlier"}}
+    trained_before = {**now, "train": {"harness": "earlier"}}
+    finished(one, tmp_path, time=took, code=timed_before)
+    finished(other, tmp_path, time=took, code=trained_before)
+
+    def expected(todo, rerun):
+        return store.hours_to_run(todo, [one, other, third], tmp_path, rerun) * 3600
+
+    assert store.to_run([one, other], tmp_path, "stale") == [one, other]
+    assert expected([one], "stale") == pytest.approx(5.0)
+    assert expected([one], "latency") == pytest.approx(5.0)
+    assert expected([one], "all") == pytest.approx(115.0)
+    assert expected([other], "stale") == pytest.approx(115.0)
+    assert expected([one, other, third], "stale") == pytest.approx(235.0)
+    assert store.hours_to_run([one], [third], tmp_path, "stale") * 3600 == pytest.approx(5.0)
+
+
 def test_rows_of_all_cells_leave_a_damaged_one_out_and_say_so(tmp_path, capsys):
     one, other, third = cells(3)
     (finished(one, tmp_path) / "row.json").write_bytes(b"")

@@ -243,7 +243,7 @@ def test_dry_run_runs_nothing_and_tells_how_long(ablate):
     assert text.endswith("nothing was run (--dry-run)\n")
     assert not ablate.runs.exists()
     ablate()
-    assert "about 1.0 hours" in ablate("--dry-run", "--seeds", "3")
+    assert "about 1h00 one after another" in ablate("--dry-run", "--seeds", "3")
 
 
 def test_smoke_goes_elsewhere(ablate):
