@@ -90,6 +90,8 @@ def test_new_settings_change_no_id():
     for change in ({"stride": 2}, {"min_flow": 1.0}):
         data = replace(cell.recipe.data, **change)
         assert replace(cell, recipe=replace(cell.recipe, data=data)).id != cell.id
+    optim = replace(cell.recipe.optim, method_lr=1e-3)  # the recipe's, then
+    cell = replace(cell, recipe=replace(cell.recipe, optim=optim))
     assert cell.id == "6e84de03340d", "as before there were these keys"
 
 

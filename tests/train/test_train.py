@@ -13,7 +13,7 @@ import pytest
 import torch
 from support.training import CPU, curve, run
 
-from mtl_bench.core.config import Optim, to_dict
+from mtl_bench.core.config import Optim, load_recipe, to_dict
 from mtl_bench.core.device import Compute, choose_device, seed_for
 from mtl_bench.core.files import write_json
 from mtl_bench.data.loader import train_batches
@@ -210,6 +210,14 @@ def test_schedule_is_the_papers():
     expected |= {30000: 0.5358867, 59999: 5.008e-5}
     for step, factor in expected.items():
         assert schedule(step, Optim()) == pytest.approx(factor, rel=1e-4)
+
+
+@pytest.mark.parametrize("recipe", ["small", "medium", "kitti-small", "kitti", "cityscapes"])
+def test_log_variances_move_no_further_than_the_papers(recipe):
+    """By 3.1 in each of two trainings: the weight of a loss that can be driven to 0, as smoothness
+    can by a flat depth, grows for as long as it may."""
+    optim = load_recipe(recipe).optim
+    assert optim.method_lr * sum(schedule(step, optim) for step in range(optim.steps)) < 3.2
 
 
 def test_engine_refuses_what_it_cannot_do():
