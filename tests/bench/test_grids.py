@@ -330,13 +330,13 @@ def test_unknown_grid():
 
 
 IDS = [  # digests of all ids of a shipped grid, and of its smoke run: what was run is found by them
-    ("ablation", "ce6b61db3228", "25ce0926b98a"),
-    ("ablation-controls", "b2b2c55d825e", "8ef8a73b2110"),
-    ("backbones", "68de144acae3", "aed5ec2cac11"),
+    ("ablation", "6535b5af648b", "25ce0926b98a"),
+    ("ablation-controls", "a482d5c2ca74", "8ef8a73b2110"),
+    ("backbones", "894e450b868b", "aed5ec2cac11"),
     ("kitti", "43149427a83e", "502da380f4d0"),
     ("latency", "a77fe8bc6487", "3ec8f9a10500"),
-    ("seeds", "3c40465d6554", "9b0f88f5d5f1"),
-    ("weighting", "c677129297d5", "2a5e2efd9ba8"),
+    ("seeds", "694e6769b028", "9b0f88f5d5f1"),
+    ("weighting", "054b497ef58a", "2a5e2efd9ba8"),
 ]
 
 
