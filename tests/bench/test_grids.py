@@ -334,7 +334,7 @@ IDS = [  # digests of all ids of a shipped grid, and of its smoke run: what was 
     ("ablation-controls", "a482d5c2ca74", "8ef8a73b2110"),
     ("backbones", "894e450b868b", "aed5ec2cac11"),
     ("kitti", "43149427a83e", "502da380f4d0"),
-    ("latency", "a77fe8bc6487", "3ec8f9a10500"),
+    ("latency", "538ae995d124", "3ec8f9a10500"),
     ("seeds", "694e6769b028", "9b0f88f5d5f1"),
     ("weighting", "054b497ef58a", "2a5e2efd9ba8"),
 ]
