@@ -27,8 +27,13 @@ from mtl_bench.report.evidence import (
     superiority,
 )
 
-RNG = np.random.default_rng(20)
 NAN, FAILED = math.nan, -math.inf
+
+
+@pytest.fixture
+def rng():
+    """Of each test its own: what one draws does not depend on which others run."""
+    return np.random.default_rng(20)
 
 
 # --- the score ------------------------------------------------------------------------------------
@@ -51,16 +56,16 @@ def test_log_gain_treats_a_doubled_and_a_halved_error_alike():
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 10])
-def test_the_interval_of_one_problem_is_scipys(count):
-    x = RNG.normal(3, 2, count)
+def test_the_interval_of_one_problem_is_scipys(count, rng):
+    x = rng.normal(3, 2, count)
     theirs = stats.ttest_1samp(x, 0).confidence_interval(0.95)
     ours = stratified_t(np.append(x, NAN)[None])  # a missing run is none
     assert (ours.mean, ours.low, ours.high) == pytest.approx((x.mean(), *theirs))
 
 
-def test_two_problems_of_unlike_spread_are_welchs_interval():
+def test_two_problems_of_unlike_spread_are_welchs_interval(rng):
     """The mean of two strata is half the difference of one and the other's negative."""
-    a, b = RNG.normal(1, 1, 5), RNG.normal(2, 8, 9)
+    a, b = rng.normal(1, 1, 5), rng.normal(2, 8, 9)
     table = np.full((2, 9), NAN)
     table[0, :5], table[1] = a, b
     theirs = stats.ttest_ind(a, -b, equal_var=False).confidence_interval(0.95)
@@ -79,8 +84,8 @@ def test_what_cannot_be_known_is_nan():
     assert (same.low, same.high) == (2, 2)
 
 
-def test_iqm_is_the_trimmed_mean():
-    x = RNG.normal(size=(4, 5))
+def test_iqm_is_the_trimmed_mean(rng):
+    x = rng.normal(size=(4, 5))
     assert iqm(x) == pytest.approx(stats.trim_mean(x, 0.25, axis=None))
     x[1, 3] = FAILED  # one of twenty is cut off with the lowest quarter
     assert iqm(x) == pytest.approx(stats.trim_mean(np.where(np.isinf(x), -1e9, x), 0.25, None))
@@ -89,9 +94,9 @@ def test_iqm_is_the_trimmed_mean():
     assert math.isnan(iqm(np.array([[NAN]])))
 
 
-def test_bootstrap_draws_all_lines_together():
+def test_bootstrap_draws_all_lines_together(rng):
     """Two lines whose difference is the same in every run: so it is in every resample."""
-    first = RNG.normal(0, 5, (3, 5))
+    first = rng.normal(0, 5, (3, 5))
     both = np.stack([first, first + 2])
     (chunk,) = evidence.resampled(both, 50, 0)
     for drawn in chunk:
@@ -117,8 +122,8 @@ def test_bootstrap_enumerates():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 10, 16])
-def test_sign_flip_is_scipys_exact_test(count):
-    d = RNG.normal(0.5, 1, count)
+def test_sign_flip_is_scipys_exact_test(count, rng):
+    d = rng.normal(0.5, 1, count)
     d[: count // 3] = 0.25  # ties
     patterns = np.array(list(itertools.product([1, -1], repeat=count))) if count <= 10 else None
     if patterns is not None:
@@ -131,8 +136,8 @@ def test_sign_flip_is_scipys_exact_test(count):
         assert sign_flip(d) == pytest.approx(theirs.pvalue)
 
 
-def test_sign_flip_of_many_blocks_is_near_the_t_test():
-    d = RNG.normal(0.4, 1, 40)
+def test_sign_flip_of_many_blocks_is_near_the_t_test(rng):
+    d = rng.normal(0.4, 1, 40)
     assert sign_flip(d) == pytest.approx(stats.ttest_1samp(d, 0).pvalue, abs=0.01)
     assert sign_flip(d) == sign_flip(d)
     assert sign_flip(np.full(40, 1.0)) == 1 / (evidence.FLIPS + 1)
@@ -155,11 +160,11 @@ def test_holm():
     assert math.isnan(found[4])
 
 
-def test_verdicts():
-    noise = RNG.normal(0, 0.2, (4, 5))
-    control = RNG.normal(0, 3, (4, 5))
+def test_verdicts(rng):
+    noise = rng.normal(0, 0.2, (4, 5))
+    control = rng.normal(0, 3, (4, 5))
     lines = np.stack([control + noise + shift for shift in (3, 0, -3)])
-    apart = control + RNG.normal(0, 4, (4, 5))
+    apart = control + rng.normal(0, 4, (4, 5))
     apart -= (apart - control).mean() - 0.7
     found = compare(np.concatenate([lines, apart[None]]), control)
     assert [each.verdict for each in found] == ["better", "equivalent", "worse", "open"]
@@ -181,8 +186,8 @@ def test_what_is_tested_is_the_mean_that_is_printed():
     assert found.p == as_far.mean()
 
 
-def test_lines_that_fail_together_are_not_equivalent():
-    control = RNG.normal(0, 1, (1, 4))
+def test_lines_that_fail_together_are_not_equivalent(rng):
+    control = rng.normal(0, 1, (1, 4))
     control[0, 2] = FAILED
     same, ahead = compare(np.stack([control, np.full((1, 4), 9.0)]), control)
     assert (same.difference.mean, same.blocks, same.failed) == (FAILED, 4, 1)
@@ -192,8 +197,8 @@ def test_lines_that_fail_together_are_not_equivalent():
     assert (math.isnan(both.difference.mean), both.failed) == (True, 2)
 
 
-def test_a_missing_run_leaves_out_its_block_and_a_failed_one_does_not():
-    control = RNG.normal(0, 1, (2, 6))
+def test_a_missing_run_leaves_out_its_block_and_a_failed_one_does_not(rng):
+    control = rng.normal(0, 1, (2, 6))
     line = control + 1
     line[0, 0], line[1, 5] = NAN, FAILED
     (found,) = compare(line[None], control)
@@ -203,18 +208,19 @@ def test_a_missing_run_leaves_out_its_block_and_a_failed_one_does_not():
     assert not found.within
 
 
-def test_students_test_is_scipys_and_leaves_out_what_it_cannot_judge():
-    d = RNG.normal(1, 1, 5)
+def test_students_test_is_scipys_and_leaves_out_what_it_cannot_judge(rng):
+    d = rng.normal(1, 1, 5)
     assert student(d) == stats.ttest_1samp(d, 0).pvalue
     assert [student(np.full(3, value)) for value in (0.0, 0.1)] == [1, 0]
     unknown = [np.array([]), np.array([1.0]), np.array([1.0, 2, FAILED])]
     assert all(math.isnan(student(d)) for d in unknown)
 
 
-def test_who_leads_a_control_has_a_p_by_holm_and_an_interval_above_0():
-    control = RNG.normal(0, 5, 6)
-    shifts = np.array([3.0, -3.0, 0.35, 0.0])[:, None]
-    lines = np.concatenate([control + shifts + RNG.normal(0, 0.3, (4, 6)), np.full((1, 6), NAN)])
+def test_who_leads_a_control_has_a_p_by_holm_and_an_interval_above_0(rng):
+    control = rng.normal(0, 5, 6)
+    t = np.array([20.0, -20.0, 2.9, 0.0])[:, None]
+    noise = math.sqrt(6) * stats.zscore(rng.normal(size=(4, 6)), axis=1, ddof=1)
+    lines = np.concatenate([control + t + noise, np.full((1, 6), NAN)])
     p = [stats.ttest_rel(line, control).pvalue for line in lines[:4]]
     assert p[2] < 0.05 < min(1, 2 * p[2])  # significant, and not among four
     assert ahead(lines, control) == [True, False, False, False, False]
@@ -237,14 +243,14 @@ def test_expected_best_is_the_mean_over_all_draws():
         assert expected_best(scores)[budget - 1] == pytest.approx(expected)
 
 
-def test_distance_to_a_front():
+def test_distance_to_a_front(rng):
     front = np.array([[0.0, 4], [2, 2], [4, 0]])
     assert behind_front(np.array([1.0, 1]), front) == 1  # one more in both reaches (2, 2)
     assert behind_front(np.array([2.0, 2]), front) == 0
     assert behind_front(np.array([5.0, 5]), front) < 0
     assert behind_front(np.array([FAILED, FAILED]), front) == -FAILED
     for tasks in (2, 3):
-        front, point = RNG.normal(0, 1, (6, tasks)), RNG.normal(0, 1, tasks)
+        front, point = rng.normal(0, 1, (6, tasks)), rng.normal(0, 1, tasks)
         steps = np.arange(-4, 4, 0.001)
         free = [not (front > point + step).all(1).any() for step in steps]
         assert behind_front(point, front) == pytest.approx(steps[free.index(True)], abs=0.0011)
@@ -263,9 +269,9 @@ def test_the_mean_of_a_suite_weighs_problems_alike():
     assert suite_mean(np.array([[[1.0, FAILED]]])) == FAILED
 
 
-def test_rank_bands_are_the_ends_over_all_choices():
+def test_rank_bands_are_the_ends_over_all_choices(rng):
     """Brute force: every definition with every problem left out, every resample of the seeds."""
-    first, second = RNG.normal(0, 1, (2, 4, 3, 2))
+    first, second = rng.normal(0, 1, (2, 4, 3, 2))
     first[1, 0, 1], first[2, 2, 0], second[1, 0, 1] = FAILED, NAN, FAILED
     choices, seeds = rank_bands([first, second], resamples=4000)
 
@@ -293,8 +299,8 @@ def test_a_line_that_lacks_every_run_has_no_rank():
     assert np.isnan([choices[1], seeds[1]]).all()
 
 
-def test_a_line_that_lacks_a_problem_moves_no_other_s_rank():
-    scores = RNG.normal(0, 1, (5, 3, 4))
+def test_a_line_that_lacks_a_problem_moves_no_other_s_rank(rng):
+    scores = rng.normal(0, 1, (5, 3, 4))
     scores[1, 2] = NAN
     others = [0, 2, 3, 4]
     found = rank_bands([scores, scores**3], resamples=200)
