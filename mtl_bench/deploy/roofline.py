@@ -8,6 +8,7 @@ import copy
 import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -20,7 +21,7 @@ from mtl_bench.core.engine import PRECISIONS
 from mtl_bench.deploy.graph import Body
 
 TRIES = 5
-MATMUL = {"cpu": 2048, "cuda": 8192}  # side of the matrices
+MATMUL = {"cpu": (1024, 1536, 2048), "cuda": (8192,)}  # sides of the matrices
 CONVOLVED = {"cpu": 1, "cuda": 64}  # images of 32 x 64 pixels and 512 channels
 COPY = {"cpu": 2**26, "cuda": 2**28}  # floats: beyond any cache
 MIB = 2**20
@@ -149,15 +150,18 @@ def _tensors_in(value: Any) -> Iterator[Tensor]:
 
 
 def peaks(device: torch.device, precision: str) -> tuple[float, float]:
-    """Measured: GFLOP/s in the precision of a large matrix product or 3 x 3 convolution, whichever
-    is faster, and GB/s of a large copy. On a CPU different libraries compute the two: MKL's product
-    reaches half of what oneDNN's convolution does on an AMD processor. torch has a product in int8,
-    and no convolution."""
+    """Measured: GFLOP/s in the precision of large matrix products or a 3 x 3 convolution, whichever
+    is fastest, and GB/s of a large copy. On a CPU different libraries compute the two: MKL's
+    product reaches half of what oneDNN's convolution does on an AMD processor. torch has a product
+    in int8, which depends on the size (with AMX 2,300 to 4,600 GFLOP/s), and no convolution."""
     dtype = PRECISIONS[precision]
-    side, images, floats = MATMUL[device.type], CONVOLVED[device.type], COPY[device.type]
-    a, b = (torch.rand(side, side, device=device).to(dtype) for _ in range(2))
+    images, floats = CONVOLVED[device.type], COPY[device.type]
     product = torch._int_mm if dtype is torch.int8 else torch.mm
-    flops = 2 * side**3 / _fastest(lambda: product(a, b), device)
+    flops = 0.0
+    for side in MATMUL[device.type]:
+        a, b = (torch.rand(side, side, device=device).to(dtype) for _ in range(2))
+        seconds = _fastest(partial(product, a, b), device)
+        flops = max(flops, 2 * side**3 / seconds)
     if dtype.is_floating_point:
         x = torch.rand(images, 512, 32, 64, device=device).to(dtype)
         weight = torch.rand(512, 512, 3, 3, device=device).to(dtype)

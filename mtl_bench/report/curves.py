@@ -12,11 +12,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mtl_bench.core.style import MANY, Look, save, styled
 from mtl_bench.report.columns import capital
-from mtl_bench.report.plots import heat_table, looks_of, watermark
+from mtl_bench.report.plots import heat_table, looks_of, plain_log, watermark
 from mtl_bench.report.table import NOTHING
 
 if TYPE_CHECKING:
@@ -188,8 +187,4 @@ def _scale(axes: Axes, column: str) -> None:
         return
     values = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.get_lines()])
     if values.min() > 0 and values.max() > 5 * values.min():
-        axes.set_yscale("log")
-        narrow = values.max() < 100 * values.min()
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if narrow else (1,)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        plain_log(axes, "y")

@@ -4,7 +4,7 @@ Colour is the backbone, marker the engine, filling the precision: the same in ev
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +52,8 @@ def against_quality(timings: "Timings", column: Column, out_dir: Path) -> str | 
         for (axes, own), points in zip(panels, fronts, strict=True):
             for line, point in zip(own, points, strict=True):
                 axes.plot(*point, linestyle="", **_marker(timings, line))
-            plain_log(axes, f"{FPS.title} ({better(FPS)} is better)")
+            plain_log(axes, "x")
+            axes.set_xlabel(f"{FPS.title} ({better(FPS)} is better)")
             axes.margins(0.12)
         for (axes, _), points in zip(panels, fronts, strict=True):  # they share the y axis
             draw_front(axes, points, (FPS.better, column.better))
@@ -101,17 +102,22 @@ def roofline(timings: "Timings", out_dir: Path) -> str | None:
     if not lines:
         return None
     with styled():
+        roofs = _roofs(lines)
         figure, panels = _panels(timings, lines)
         for axes, own in panels:
             points = [_work(line) for line in own]
             for line, point in zip(own, points, strict=True):
                 axes.plot(*point, linestyle="", **_marker(timings, line))
-            _roofs(axes, own, [x for x, _ in points])
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter("{x:g}")
-            plain_log(axes, "operations a byte")
+            _draw_roofs(axes, roofs, [x for x, _ in points])
+            plain_log(axes, "x")
+            plain_log(axes, "y")
+            axes.set_xlabel("operations a byte")
         panels[0][0].set_ylabel("GFLOP/s of the network")
-        _legend(figure, timings, lines, [])
+        peaks = [
+            Line2D([], [], color=GRAY, label=f"{named}: {gflops:.0f} GFLOP/s, {gbs:.0f} GB/s")
+            for (gflops, gbs), named in roofs.items()
+        ]
+        _legend(figure, timings, lines, peaks)
         save(figure, out_dir, "roofline")
     best = max(lines, key=lambda line: line.values["roofline"])
     metric = best.row["metric"]
@@ -213,18 +219,28 @@ def _work(line: "Line") -> tuple[float, float]:
     return gflop * 1000 / metric["latency.network_mb"], gflop * 1000 / line.values["network_ms"]
 
 
-def _roofs(axes: Axes, lines: Sequence["Line"], intensities: Sequence[float]) -> None:
-    """One roof for each precision: the highest peaks that any of its timings measured."""
-    roofs: dict[tuple[float, ...], list[str]] = {}
+def _roofs(lines: Sequence["Line"]) -> dict[tuple[float, float], str]:
+    """GFLOP/s and GB/s, highest first -> precisions: the highest peaks that any of a precision's
+    timings measured."""
+    roofs: dict[tuple[float, float], list[str]] = {}
     for precision in dict.fromkeys(line.names[3] for line in lines):
         metrics = [line.row["metric"] for line in lines if line.names[3] == precision]
-        peaks = [max(m[f"roofline.{key}"] for m in metrics) for key in ("peak_gflops", "peak_gbs")]
-        roofs.setdefault(tuple(peaks), []).append(precision)
+        gflops, gbs = (max(m[f"roofline.peak_{key}"] for m in metrics) for key in ("gflops", "gbs"))
+        roofs.setdefault((gflops, gbs), []).append(precision)
+    return {peaks: ", ".join(roofs[peaks]) for peaks in sorted(roofs, reverse=True)}
+
+
+def _draw_roofs(
+    axes: Axes, roofs: Mapping[tuple[float, float], str], intensities: Sequence[float]
+) -> None:
+    """Each with its precisions to the right of the panel."""
     ridges = [gflops / gbs for gflops, gbs in roofs]
     x = np.geomspace(min([*ridges, *intensities]) / 3, max([*ridges, *intensities]) * 3, 64)
-    for (gflops, gbs), precisions in roofs.items():
+    for (gflops, gbs), named in roofs.items():
         axes.plot(x, np.minimum(gflops, gbs * x), color=GRAY, linewidth=1.2, zorder=1)
-        named = f"{', '.join(precisions)}: {gflops:.0f} GFLOP/s, {gbs:.0f} GB/s"
-        near = max((other for other, _ in roofs if 1 < other / gflops < NEAR), default=None)
-        y = 1.05 * gflops if near is None else 1.2 * near  # a line above that one's words
-        axes.text(x[-1], y, named, ha="right", va="bottom", fontsize=7.5, color=GRAY)
+        above = any(1 < other / gflops < NEAR for other, _ in roofs)
+        below = any(1 < gflops / other < NEAR for other, _ in roofs)
+        side = "center" if above == below else "top" if above else "bottom"
+        place = (x[-1], gflops)
+        axes.annotate(f" {named}", place, va=side, fontsize=7.5, color=GRAY, annotation_clip=False)
+    axes.set_xlim(x[0], x[-1])

@@ -7,11 +7,12 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
@@ -274,13 +275,15 @@ def _merged(several: Iterable[Iterable[str]]) -> list[str]:
     return found
 
 
-def plain_log(axes: Axes, label: str) -> None:
-    """A logarithmic x axis with 1, 2, 5, 10 in plain digits."""
-    axes.set_xscale("log")
-    axes.set_xlabel(label)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
+def plain_log(axes: Axes, name: Literal["x", "y"]) -> None:
+    """Make an axis of what is drawn logarithmic, with 1, 10 in plain digits; below two decades 2
+    and 5, too."""
+    axes.set(**{f"{name}scale": "log"})
+    axis: Axis = getattr(axes, f"{name}axis")
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
 
 
 def middle(lows: NDArray[np.float64], highs: NDArray[np.float64], least: float = 0.0) -> Point:

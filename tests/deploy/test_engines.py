@@ -435,9 +435,13 @@ def test_work_of_a_network_is_that_of_its_convolutions(monkeypatch):
     assert roofline.share({"gmacs": 0.1, "network_mb": 20}, 100, 1, 40) == pytest.approx(0.5)
 
 
-def test_the_peak_is_the_faster_of_a_product_and_a_convolution(monkeypatch):
+def test_the_peak_is_the_fastest_of_products_and_a_convolution(monkeypatch):
     product, convolution = 2 * 2048**3, 2 * 9 * 512 * 512 * 32 * 64
-    for seconds, flops in (((1.0, 0.1, 2.0), 10 * convolution), ((1.0, 1.0, 2.0), product)):
+    for seconds, flops in (
+        ((1.0, 1.0, 1.0, 0.1, 2.0), 10 * convolution),
+        ((1.0, 1.0, 1.0, 1.0, 2.0), product),
+        ((1.0, 0.1, 1.0, 1.0, 2.0), 10 * 2 * 1536**3),
+    ):
         taken = iter(seconds)
         monkeypatch.setattr(roofline, "_fastest", lambda run, device, taken=taken: next(taken))
         peaks = roofline.peaks(CPU, "fp32")
@@ -445,7 +449,7 @@ def test_the_peak_is_the_faster_of_a_product_and_a_convolution(monkeypatch):
 
 
 def test_the_peak_in_int8_is_that_of_a_product(monkeypatch):
-    monkeypatch.setattr(roofline, "MATMUL", {"cpu": 64})
+    monkeypatch.setattr(roofline, "MATMUL", {"cpu": (64,)})
 
     def once(run, device):
         run()

@@ -11,6 +11,7 @@ import fake_latency
 import fake_rows
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from mtl_bench.core import style
 from mtl_bench.core.recipe import Recipe
@@ -308,6 +309,36 @@ def test_roofline_needs_its_numbers(tmp_path):
     caption = latency_plots.roofline(tabulate([fake_latency.make_row("eager")]), tmp_path)
     assert "160.0 GFLOP and 900 MB a frame allow at 300 GFLOP/s and 20.0 GB/s" in caption
     assert "36 % of what" in caption
+
+
+@pytest.mark.parametrize(
+    ("values", "shown"),
+    [
+        ((165, 3400), ["200", "500", "1000", "2000"]),  # fp32 and AMX: one power of ten in it
+        ((5, 2700), ["10", "100", "1000"]),  # 2 and 5 would run into each other
+        ((0.7, 6), ["1", "2", "5"]),
+    ],
+)
+@pytest.mark.parametrize("name", ["x", "y"])
+def test_logarithmic_axes_have_plain_numbers(values, shown, name):
+    axes = Figure().subplots()
+    axes.plot(values, values)
+    plots.plain_log(axes, name)
+    axis = axes.xaxis if name == "x" else axes.yaxis
+    low, high = axis.get_view_interval()
+    ticks = zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=True)
+    assert [label.get_text() for place, label in ticks if low <= place <= high] == shown
+    assert not any(label.get_text() for label in axis.get_ticklabels(minor=True))
+
+
+def test_a_roof_is_the_highest_of_all_timings_of_a_precision():
+    def line(precision, gflops, gbs):
+        metric = {"roofline.peak_gflops": gflops, "roofline.peak_gbs": gbs}
+        return SimpleNamespace(names=("", "", "", precision), row={"metric": metric})
+
+    lines = [line("fp32", 400, 25), line("int8", 3000, 20), line("fp32", 350, 26)]
+    roofs = latency_plots._roofs([*lines, line("fp16", 400, 26)])
+    assert list(roofs.items()) == [((3000, 20), "int8"), ((400, 26), "fp32, fp16")]
 
 
 def test_the_same_rows_give_the_same_bytes(built, tmp_path):
